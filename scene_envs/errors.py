@@ -1,4 +1,4 @@
-"""Exception family of SceneEnvs: every message names the value, the place and the fix."""
+"""Exceptions of SceneEnvs; every message names the value, the place and the remedy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class InvalidInputError(SceneEnvsError, ValueError):
 
 
 class UnknownNameError(SceneEnvsError, KeyError):
-    """No registry knows the name that was asked for."""
+    """No component has the given name."""
 
     def __str__(self) -> str:  # KeyError would print the repr of the message
         return str(self.args[0]) if self.args else ""
@@ -38,11 +38,11 @@ class RewardError(SceneEnvsError):
 
 
 class RewardTimeoutError(RewardError):
-    """A reward took longer than it may."""
+    """A reward exceeded its time limit."""
 
 
 class TrainingError(SceneEnvsError):
-    """A training run cannot go on; what was done so far is on disk."""
+    """A training run cannot continue; its progress so far is on disk."""
 
 
 class StorageError(SceneEnvsError, OSError):
@@ -55,9 +55,9 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
     When ``name`` is the last part of a known dotted name, that dotted name is offered.
 
     Args:
-        kind: what was looked up, in words a user knows ("scene type", "reward", "prior").
-        name: the name that was asked for.
-        known: all names that would have worked.
+        kind: Kind of the name, in a user's words ("scene type", "reward", "prior").
+        name: Unknown name.
+        known: All known names.
 
     >>> str(unknown_name("reward", "object_cuont", ["object_count", "feasible_objects"]))
     "unknown reward 'object_cuont'; did you mean 'object_count'? Known: feasible_objects, object_count."

@@ -24,12 +24,12 @@ _SEAL = "# scene-envs, sha256 of the lines below: "
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Context with a temporary file to write, which is renamed to ``path`` when the block ends without an error.
 
-    The folder is made if need be. The temporary file lies beside ``path`` and has the hidden name
+    The folder is made if it is missing. The temporary file lies in the same folder under the hidden name
     ``.<name>.<process>.<random>.partial``. When the block fails, the temporary file is removed, and a file that was at
     ``path`` before stays unchanged.
 
     Raises:
-        StorageError: the operating system refused to write or to rename; names the file and the remedy.
+        StorageError: the operating system refused to write or to rename; the message names the file and the remedy.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -129,16 +129,16 @@ def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
 def without_digest(content: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
     """``content`` without the digest of :func:`with_digest`, after a check against that digest.
 
-    Content without a digest is returned as it is, because such a file may be written by hand.
+    Content without a digest is returned unchanged, because such a file may be written by hand.
 
     Raises:
-        CorruptFileError: the content is not what was written; the message says how to accept an edit.
+        CorruptFileError: the content was changed; the message says how to accept an edit.
     """
     plain = {key: value for key, value in content.items() if key != DIGEST}
     if DIGEST in content and content[DIGEST] != _digest_of(plain):
         raise CorruptFileError(
             f"{str(path)!r} was changed after it was written (checksum); copy it again, or if you edited it, remove "
-            f"its key {DIGEST!r} to have it read as it is"
+            f"its key {DIGEST!r} to read it without a check"
         )
     return plain
 

@@ -1,4 +1,4 @@
-"""Locks of folders, which admit one writer at a time, and removal of files that killed writers left half-written."""
+"""Locks of folders, which admit one writer at a time, and removal of half-written files of killed writers."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ _guard = threading.Lock()
 
 @contextmanager
 def claimed(folder: str | os.PathLike[str], owner: str) -> Iterator[Path]:
-    """Context in which this process alone writes into ``folder``, which is made if need be.
+    """Context in which this process alone writes into ``folder``, which is made if it is missing.
 
-    The claim ends with the process, however it ends, and may be repeated by the same process. Files that a killed
-    process left half-written in the folder are removed.
+    The claim ends with the process, even if it is killed, and may be repeated by the same process. Half-written files
+    of killed processes in the folder are removed.
 
     Args:
-        folder: where to write.
-        owner: name of the writer, for the message that other processes get.
+        folder: Folder to write into.
+        owner: Name of the writer, for the error message of other processes.
 
     Raises:
-        InvalidInputError: another process writes there (it is named), or ``folder`` is a file.
+        InvalidInputError: another process writes into the folder (it is named), or ``folder`` is a file.
         StorageError: the folder cannot be made or written to.
 
     >>> from tempfile import TemporaryDirectory
@@ -94,12 +94,12 @@ def _lock(path: Path, owner: str) -> int:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            told = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
+            writer = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
             os.close(descriptor)
             if error.errno in (errno.EAGAIN, errno.EACCES):
                 raise InvalidInputError(
-                    f"{str(path.parent)!r} is being written by {told or 'another process'}; wait until it is done, "
-                    f"or give another output{_takeover(told, path)}"
+                    f"{str(path.parent)!r} is being written by {writer or 'another process'}; wait until it is done, "
+                    f"or give another output{_takeover(writer, path)}"
                 ) from None
             raise
         if (foreign := _owner_elsewhere(descriptor)) is not None:
@@ -110,7 +110,7 @@ def _lock(path: Path, owner: str) -> int:
                 f"remove {str(path)!r}"
             )
         with contextlib.suppress(FileNotFoundError):
-            if os.fstat(descriptor).st_ino == os.stat(path).st_ino:  # nobody removed it meanwhile
+            if os.fstat(descriptor).st_ino == os.stat(path).st_ino:  # it was not removed meanwhile
                 text = f"{owner}, process {os.getpid()} on {socket.gethostname()}, since {time.strftime('%F %T')}"
                 os.truncate(descriptor, 0)
                 os.pwrite(descriptor, text.encode(), 0)
@@ -118,8 +118,8 @@ def _lock(path: Path, owner: str) -> int:
         os.close(descriptor)
 
 
-def _takeover(told: str, path: Path) -> str:
-    elsewhere = told and f" on {socket.gethostname()}, since" not in told
+def _takeover(writer: str, path: Path) -> str:
+    elsewhere = writer and f" on {socket.gethostname()}, since" not in writer
     return f"; if that computer was switched off, remove {str(path)!r}" if elsewhere else ""
 
 
@@ -128,10 +128,10 @@ def _owner_elsewhere(descriptor: int) -> str | None:
 
     A file system may share files between computers without their locks.
     """
-    told = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
-    found = re.search(r"process \d+ on (.+), since", told)
+    writer = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
+    found = re.search(r"process \d+ on (.+), since", writer)
     recent = time.time() - os.fstat(descriptor).st_mtime < _SILENCE
-    return told if found is not None and found[1] != socket.gethostname() and recent else None
+    return writer if found is not None and found[1] != socket.gethostname() and recent else None
 
 
 @contextmanager

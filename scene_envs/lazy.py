@@ -11,13 +11,10 @@ from typing import Any
 
 
 def lazy_names(package: str, file: str) -> Callable[[str], Any]:
-    """A module's ``__getattr__`` (PEP 562) that imports what the module imports under ``if TYPE_CHECKING:``.
+    """A module's ``__getattr__`` (PEP 562), which imports the names that the module lists under ``if TYPE_CHECKING:``.
 
     Type checkers and readers see plain imports, which are the only list of names and of the modules that define them.
-
-    Args:
-        package: the module's ``__name__``.
-        file: its ``__file__``, whose source is read when the first name is asked for.
+    ``package`` and ``file`` are ``__name__`` and ``__file__`` of the module, whose source is read at the first lookup.
     """
 
     @cache

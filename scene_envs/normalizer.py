@@ -18,14 +18,14 @@ _ZERO_RANGE = 1e-6
 class Normalizer:
     """The map ``x' = x * scale + min`` per feature, with constant features kept exact.
 
-    A feature whose range over the data is zero has ``scale = 0``: it is 0 when normalised and comes
-    back as the constant it was, whatever value a sampler produced for it.
+    A feature whose range over the data is zero has ``scale = 0``: it is 0 when normalised, and
+    :meth:`unnormalize` returns its constant for any sampled value.
 
     Attributes:
         scale: (D,) float32; 0 marks a constant feature.
         min: (D,) float32 offset of the normalised value.
-        input_min: (D,) float32, smallest raw value seen (metres for translations).
-        input_max: (D,) float32, largest raw value seen.
+        input_min: (D,) float32, smallest raw value (metres for translations).
+        input_max: (D,) float32, largest raw value.
 
     >>> data = torch.tensor([[[0.0, 5.0], [2.0, 5.0]]])
     >>> normalizer = Normalizer.fit(data)
@@ -64,18 +64,18 @@ class Normalizer:
 
     def normalize(self, raw: Tensor) -> Tensor:
         """Raw (..., D) to normalised (..., D)."""
-        self._check(raw)
+        self._require_width(raw)
         return raw * self.scale.to(raw) + self.min.to(raw)
 
     def unnormalize(self, normalised: Tensor) -> Tensor:
         """Normalised (..., D) to raw (..., D); constant features take their constant."""
-        self._check(normalised)
+        self._require_width(normalised)
         constant = self.is_constant.to(normalised.device)
         scale = self.scale.to(normalised)
         raw = (normalised - self.min.to(normalised)) / torch.where(constant, torch.ones_like(scale), scale)
         return torch.where(constant, self.input_min.to(normalised), raw)
 
-    def _check(self, x: Tensor) -> None:
+    def _require_width(self, x: Tensor) -> None:
         if x.shape[-1] != self.scale.shape[0]:
             raise InvalidInputError(
                 f"the normalizer was fitted on {self.scale.shape[0]} features, the tensor has {x.shape[-1]} "
@@ -111,11 +111,11 @@ class Normalizer:
         try:
             scale, offset, low, high = (torch.tensor(vector, dtype=torch.float32) for vector in vectors)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise InvalidInputError(f"normalizer_state holds what are no numbers: {str(error)[:200]}") from error
+            raise InvalidInputError(f"normalizer_state holds values that are no numbers: {str(error)[:200]}") from error
         shapes = {tuple(vector.shape) for vector in (scale, offset, low, high)}
         if len(shapes) > 1 or scale.ndim != 1 or not all(map(_is_finite, (scale, offset, low, high))):
             raise InvalidInputError(
-                f"normalizer_state needs four lists of as many finite numbers, it has shapes {sorted(shapes)}"
+                f"normalizer_state needs four lists of finite numbers of one length, it has shapes {sorted(shapes)}"
             )
         return cls(scale, offset, low, high)
 

@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 @cache
 def page_part(package: str, name: str) -> str:
-    """The text of a file beside the code of ``package``."""
+    """The text of a file in the folder of ``package``."""
     return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 @cache
 def page_template(package: str, name: str, *, trim_blocks: bool = False) -> Template:
-    """The template in a file beside the code of ``package``.
+    """The template in a file in the folder of ``package``.
 
     The template escapes all text. Its filter ``png`` gives the bytes of the file at a path in base 64.
     """

@@ -1,4 +1,4 @@
-"""Entry points: contents that installed packages add to the registries of SceneEnvs."""
+"""Entry points, by which installed packages add components to the registries of SceneEnvs."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _LOGGER = logging.getLogger(__name__)
 def plugin_entry_points(group: str) -> dict[str, EntryPoint]:
     """The entry points of ``group`` by name, of all installed packages.
 
-    Entry points that the ``pyproject.toml`` of a checkout declares replace installed ones of the same name. An
-    editable install keeps the metadata of the day it was made, and a checkout on the path has no metadata.
+    Entry points that the ``pyproject.toml`` of a checkout declares replace installed ones of the same name. The
+    metadata of an editable install may be out of date, and a checkout on the path has none.
     """
     installed = {point.name: point for point in entry_points(group=group)}
     declared = _checkout_entry_points(Path(__file__).parents[1] / "pyproject.toml").get(group, {})
@@ -65,7 +65,7 @@ def load_plugin(point: EntryPoint) -> Any:
     compiled code that holds the interpreter.
 
     Raises:
-        PluginError: the import failed; says how.
+        PluginError: the import failed; the message gives the reason.
     """
     seconds = _seconds()
     try:
@@ -86,7 +86,7 @@ class PluginError(SceneEnvsError):
 
 
 _LATE = "the import of a plug-in takes too long"
-_MOST_TEXT = 500
+_MAX_TEXT = 500
 
 
 def _text(error: BaseException) -> str:
@@ -94,7 +94,7 @@ def _text(error: BaseException) -> str:
         text = str(error)
     except Exception:
         return "(its text cannot be read)"
-    return text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}..."
+    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}..."
 
 
 def _seconds() -> float:

@@ -9,22 +9,19 @@ from types import TracebackType
 from scene_envs.errors import unknown_name
 
 STYLES = ("bar", "lines", "none")
-"""How progress is shown; where there is no terminal, a bar becomes lines."""
+"""Styles of progress; where there is no terminal, a bar becomes lines."""
 
 
 class Progress:
-    """Context manager that shows how far some work is.
+    """Context manager that shows the progress of work.
 
     Args:
-        title: what is done.
-        total: how many there are to do.
-        done: how many were done before.
+        title: Title of the work.
+        total: Total number of items.
+        done: Number of items that were done before.
         style: ``"bar"`` (lines where stderr is no terminal), ``"lines"`` or ``"none"``.
-        every: seconds between lines.
-        always: numbers done at which a line is printed however little time has passed.
-
-    Attributes:
-        seconds: since this object was made.
+        every: Seconds between lines.
+        always: Numbers of items at which a line is printed regardless of the time since the last one.
 
     >>> with Progress("Counting", 3, style="none") as progress:
     ...     progress.update(3, "all of them")
@@ -80,13 +77,7 @@ class Progress:
         return perf_counter() - self._started
 
     def update(self, done: int, text: str, line: str = "") -> None:
-        """Show that ``done`` of the total are done.
-
-        Args:
-            done: how many of the total.
-            text: what stands beside the bar, in the markup of rich.
-            line: what is printed where there is no bar.
-        """
+        """Show that ``done`` of the total are done: ``text`` (rich markup) after the bar, or ``line`` without a bar."""
         self._bar.update(self._task, completed=done, text=text)
         now = perf_counter()
         if self._prints and line and (now - self._printed >= self.every or done in self.always):

@@ -17,15 +17,15 @@ class Registry(dict[str, Component]):
     """Components of one kind by name; the lookup of a missing name first loads the module that registers it.
 
     Args:
-        kind: what messages call a component, such as ``"planner"``.
-        group: entry points of installed packages.
-        components: those that are there from the start.
-        modules: modules of this project by name of the component that each registers when it is imported.
-        read: function from the entry point with the name of a component to that component; None where the entry points
+        kind: Kind of the components in messages, such as ``"planner"``.
+        group: Group of entry points of installed packages.
+        components: Components that are registered from the start.
+        modules: Modules of this project, by name of the component that each registers when it is imported.
+        read: Function from the entry point with the name of a component to that component; None where the entry points
             are modules that register components when they are imported.
 
     Raises:
-        UnknownNameError: at a lookup, when nothing has that name; the nearest known one is offered.
+        UnknownNameError: no component has the name of a lookup; the nearest known one is offered.
 
     >>> teas = Registry("tea", "doctest.teas", {"green": 80})
     >>> teas["green"], teas.names()

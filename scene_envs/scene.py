@@ -22,17 +22,19 @@ POSE = slice(0, POSE_FEATURES)
 TRANSLATION = slice(0, 3)
 ROTATION = slice(3, POSE_FEATURES)
 CATEGORY = slice(POSE_FEATURES, None)
+_ORTHOGONAL = 1e-3
+"""Largest entry of R^T R - I of a rotation matrix R."""
 
 
 class SceneBatch(AssetFacts):
     """B scenes of N slots each, with their scene type.
 
     A slot is translation (m, world frame) | rotation matrix row-major | one-hot over C assets + empty last.
-    Empty slots are zeros but for their last entry. Slots are a set: their order means nothing.
+    Empty slots are zeros but for their last entry. The order of slots has no meaning.
 
     Args:
         tensor: (B, N, 3 + 9 + C + 1) float32, raw (not normalised) and finite.
-        scene_type: the scene type or its name.
+        scene_type: Scene type or its name.
 
     Raises:
         InvalidInputError: wrong shape, or a value that is not finite (its scene, slot and feature are named).
@@ -44,10 +46,8 @@ class SceneBatch(AssetFacts):
 
     def __init__(self, tensor: Tensor, scene_type: str | SceneType) -> None:
         self.scene_type = get_scene_type(scene_type)
-        _check_scene_tensor(tensor, self.scene_type)
+        _require_scene_tensor(tensor, self.scene_type)
         self._tensor = tensor.to(torch.float32)
-
-    # -- construction -------------------------------------------------------------------------
 
     @classmethod
     def from_parts(
@@ -76,11 +76,11 @@ class SceneBatch(AssetFacts):
 
         Args:
             tensor: (B, N, D) floats.
-            scene_type: the scene type or its name.
-            normalised: the normalizer ``tensor`` was normalised with; None when it is raw.
+            scene_type: Scene type or its name.
+            normalised: Normalizer that ``tensor`` was normalised with; None when it is raw.
         """
         scene_type = get_scene_type(scene_type)
-        _check_scene_tensor(tensor, scene_type)
+        _require_scene_tensor(tensor, scene_type)
         categories = tensor[..., CATEGORY].argmax(dim=-1)
         raw = tensor.float() if normalised is None else normalised.unnormalize(tensor.float())
         rotations = project_to_so3(raw[..., ROTATION].unflatten(-1, (3, 3)))
@@ -88,7 +88,7 @@ class SceneBatch(AssetFacts):
 
     @classmethod
     def empty(cls, scene_type: str | SceneType, count: int, slots: int | None = None) -> SceneBatch:
-        """``count`` scenes that hold the fixed welded objects and nothing else."""
+        """``count`` scenes with the fixed welded objects alone."""
         scene_type = get_scene_type(scene_type)
         slots = scene_type.slots if slots is None else slots
         translations = torch.zeros(count, slots, 3)
@@ -109,8 +109,6 @@ class SceneBatch(AssetFacts):
         if len(names) > 1:
             raise InvalidInputError(f"cannot concatenate scenes of different types: {sorted(names)}")
         return cls(torch.cat([batch.tensor for batch in batches]), batches[0].scene_type)
-
-    # -- views ----------------------------------------------------------------------------------
 
     @property
     def tensor(self) -> Tensor:
@@ -150,7 +148,7 @@ class SceneBatch(AssetFacts):
 
     @property
     def is_furniture(self) -> Tensor:
-        """(B, N) bool: welded objects of kinds that are generated, such as the tables of a room."""
+        """(B, N) bool: welded objects that are generated, such as the tables of a room."""
         furniture = torch.tensor(self.scene_type.furniture_categories, device=self._tensor.device, dtype=torch.long)
         return torch.isin(self.categories, furniture)
 
@@ -210,8 +208,6 @@ class SceneBatch(AssetFacts):
     def __repr__(self) -> str:
         return f"SceneBatch({self.scene_type.name!r}, {tuple(self._tensor.shape)})"
 
-    # -- files ----------------------------------------------------------------------------------
-
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write to one ``.safetensors`` file, atomically."""
         return write_tensors(path, {"scenes": self._tensor}, {"scene_type": self.scene_type.name})
@@ -230,7 +226,23 @@ class SceneBatch(AssetFacts):
             raise CorruptFileError(f"{str(path)!r} is not a scene file written by SceneBatch.save: {error}") from error
 
 
-def _check_scene_tensor(tensor: Tensor, scene_type: SceneType) -> None:
+def require_rigid_poses(batch: SceneBatch) -> None:
+    """Raise InvalidInputError for a pose that is not finite, and for a matrix that is not a rotation."""
+    present = ~batch.is_empty
+    finite = torch.isfinite(batch.tensor[..., POSE]).all(dim=-1)
+    product = batch.rotations.transpose(-1, -2) @ batch.rotations - torch.eye(3, device=batch.tensor.device)
+    rotation = (product.abs().amax(dim=(-1, -2)) < _ORTHOGONAL) & (torch.linalg.det(batch.rotations) > 0)
+    for good, what in ((finite, "a pose that is not finite"), (rotation, "a matrix that is not a rotation")):
+        bad = torch.nonzero(present & ~good)
+        if len(bad):
+            scene, slot = bad[0].tolist()
+            raise InvalidInputError(
+                f"scene {scene}, slot {slot} holds {what}: {batch.tensor[scene, slot, POSE].tolist()}; "
+                "SceneBatch.from_tensor turns the output of a sampler into valid poses"
+            )
+
+
+def _require_scene_tensor(tensor: Tensor, scene_type: SceneType) -> None:
     if tensor.ndim != 3 or tensor.shape[-1] != scene_type.features:
         raise InvalidInputError(
             f"scenes of {scene_type.name!r} are (B, N, {scene_type.features}) tensors, got shape {tuple(tensor.shape)}"

@@ -29,7 +29,7 @@ def cutoff(scene_type: SceneType) -> float:
 
 
 def scene_distances(batch: SceneBatch, other: SceneBatch) -> Tensor:
-    """(B,) m: how far each scene is from its counterpart in ``other``, as sets of objects; orientations do not count.
+    """(B,) m: distance of each scene from its counterpart in ``other``, as sets of objects; orientations do not count.
 
     This is the OSPA distance of order 1 (Schuhmacher, Vo and Vo, 2008). Objects are matched one to one at the least
     total cost. A match costs the distance of the two positions, at most c, or c when the assets differ. Each object
@@ -55,11 +55,7 @@ def scene_distances(batch: SceneBatch, other: SceneBatch) -> Tensor:
 
 
 class SceneObjects:
-    """The objects that count in each scene of a batch, sorted by category; made when asked for.
-
-    Args:
-        batch: B scenes.
-    """
+    """The counted objects of each scene of a batch, sorted by category; each scene is computed on first use."""
 
     def __init__(self, batch: SceneBatch) -> None:
         self._present = counted_objects(batch).cpu().numpy()
@@ -82,7 +78,7 @@ class SceneObjects:
 
 
 def counted_objects(batch: SceneBatch) -> Tensor:
-    """(B, N) bool: objects, but for the fixed welded ones that are in every scene."""
+    """(B, N) bool: objects without the fixed welded ones that are in every scene."""
     fixed = torch.tensor(batch.scene_type.fixed_categories, dtype=torch.long, device=batch.tensor.device)
     return ~batch.is_empty & ~torch.isin(batch.categories, fixed)
 
@@ -91,14 +87,14 @@ def matching_distance(first: PlacedObjects, second: PlacedObjects, limit: float)
     """Distance (m) of two scenes, as in :func:`scene_distances`; ``limit`` (m) is the cost of an unmatched object."""
     from scipy.optimize import linear_sum_assignment
 
-    count, most = len(first[0]), max(len(first[0]), len(second[0]))
-    if not most:
+    count, larger = len(first[0]), max(len(first[0]), len(second[0]))
+    if not larger:
         return 0.0
     apart = np.sqrt(((first[1][:, None] - second[1][None]) ** 2).sum(axis=-1))
     cost = np.where(first[0][:, None] == second[0][None], np.minimum(apart, limit), limit)
     rows, columns = linear_sum_assignment(cost)
     matched = float(cost[rows, columns].sum())
-    return (matched + limit * (most - min(count, len(second[0])))) / most
+    return (matched + limit * (larger - min(count, len(second[0])))) / larger
 
 
 def check_same_assets(batch: SceneBatch, other: SceneBatch) -> None:

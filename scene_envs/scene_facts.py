@@ -1,4 +1,4 @@
-"""Facts of scenes that rewards are made of: sizes, boxes, masses, volumes, assets by name, supports."""
+"""Facts of scenes for rewards: sizes, boxes, masses, volumes, assets by name, supports."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class AssetFacts(ABC):
 
     @property
     def supports(self) -> Tensor:
-        """(B, N) int64: slot of what each object stands on or lies in; -1 for nothing, fixed things and empty slots.
+        """(B, N) int64: slot of the support or container of each object; -1 for none, fixed objects and empty slots.
 
         Two surfaces touch when they are at most 1 cm apart or at most 1 cm into each other. These are the
         supports that prompts describe (:func:`scene_envs.datasets.scene_facts`).
@@ -124,7 +124,7 @@ class AssetFacts(ABC):
         """(B, N) bool: slots that hold one of the named assets.
 
         Args:
-            *names: asset names, display names ("steamer lid") or groups such as ``"edible"``
+            *names: Asset names, display names ("steamer lid") or groups such as ``"edible"``
                 (:data:`scene_envs.assets.ASSET_GROUPS`).
 
         Raises:

@@ -1,4 +1,4 @@
-"""Sources of scenes: a file, the folder of a run, a dataset. Imports no torch before it reads."""
+"""Sources of scenes: a file, the folder of a run, a dataset. The module does not import torch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def find_scenes(path: Path) -> Path:
     """The file or folder of scenes that ``scenes=`` names; for a run's folder, the scene file in it.
 
     Raises:
-        InvalidInputError: nothing is at ``path``, or the folder holds a prior and no scenes.
+        InvalidInputError: ``path`` does not exist, or the folder holds a prior and no scenes.
     """
     from scene_envs.files import exists
 
@@ -50,11 +50,11 @@ def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
     """Scenes from a scene file, a folder of them, a run's folder with a scene file, a dataset or a file of a dataset.
 
     Args:
-        path: file or folder.
-        count: largest number of scenes, the first ones; None for all. Files are read in order of name.
+        path: File or folder.
+        count: Largest number of scenes, the first ones; None for all. Files are read in order of name.
 
     Raises:
-        InvalidInputError: ``count`` below 1, nothing there, or files of several scene types.
+        InvalidInputError: ``count`` is below 1, ``path`` does not exist, or its files are of several scene types.
     """
     from scene_envs.datasets import SceneDataset
     from scene_envs.scene import SceneBatch

@@ -1,4 +1,4 @@
-"""Supports of the objects of a batch: the thing each stands on or lies in, and its tier."""
+"""Supports of the objects of a batch: the object that each stands on or lies in, and its tier."""
 
 from __future__ import annotations
 
@@ -12,41 +12,30 @@ from scene_envs.assets.support_shapes import LibraryShapes, library_shapes
 from scene_envs.scene_types import SceneType
 
 CONTACT = 0.01
-"""Surfaces this far (m) apart, or into each other, touch."""
+"""Largest gap or overlap (m) of surfaces that touch."""
 LARGEST_CONTACT = 0.03
-"""No tolerance of contacts may be larger than this (m)."""
+"""Largest allowed tolerance of contacts (m)."""
 _FAR = 3.0
 """An object that touches nothing is still on a table or tier within this many times the tolerance."""
 _UPRIGHT = 0.85
-"""Cosine of the tilt up to which a thing carries others."""
+"""Cosine of the tilt up to which an object carries others."""
 _STEEPNESS = 20.0
-"""Foot points lie low and far out: 1/20 m more height cancels 1 m more distance outward."""
+"""Weight of height in the choice of foot points: 1/20 m more height cancels 1 m more distance outward."""
 _DIRECTIONS = np.stack([np.cos(np.arange(8) * np.pi / 4.0), np.sin(np.arange(8) * np.pi / 4.0)], axis=1)  # (8, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """n objects of several scenes, one after the other.
+    """n objects of several scenes, one after the other."""
 
-    Attributes:
-        scene: (n,) index of the scene, ascending.
-        category: (n,).
-        rotation: (n, 3, 3) asset frame to world.
-        translation: (n, 3) m.
-        center: (n, 3) centre of mass, world frame, m.
-        points: (n, 3, V) extreme points, world frame, m.
-        feet: (n, 9, 3) eight low points all round and their mean, m.
-        fixed: (n,) bool, static or welded.
-    """
-
-    scene: Index
-    category: Index
-    rotation: Array
-    translation: Array
-    center: Array
-    points: Array
-    feet: Array
-    fixed: Mask
+    scene: Index  # (n,) index of the scene, ascending
+    category: Index  # (n,) index of the asset
+    rotation: Array  # (n, 3, 3) rotation from the asset frame to the world
+    translation: Array  # (n, 3) position of the asset frame, m
+    center: Array  # (n, 3) centre of mass, world frame, m
+    points: Array  # (n, 3, V) extreme points, world frame, m
+    feet: Array  # (n, 9, 3) eight low points all round and their mean, m
+    fixed: Mask  # (n,) bool, static or welded
 
     @classmethod
     def of(
@@ -91,21 +80,13 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Holding:
-    """Supports of n objects; indices are into the same n.
+    """Supports of n objects; indices are into the same n."""
 
-    Attributes:
-        support: (n,) the thing that each object stands on or lies in; -1 for none.
-        contained: (n,) bool: the object lies in its support.
-        inside: (n,) the innermost container with the object in it or on top of its contents; -1 for none.
-        place: (n,) the first fixed thing down the chain of supports; -1 for none.
-        tier: (n,) tier of ``place``, counted from the top; -1 where ``place`` has none.
-    """
-
-    support: Index
-    contained: Mask
-    inside: Index
-    place: Index
-    tier: Index
+    support: Index  # (n,) object that each object stands on or lies in; -1 for none
+    contained: Mask  # (n,) bool; True where the object lies in its support
+    inside: Index  # (n,) innermost container with the object in it or on top of its contents; -1 for none
+    place: Index  # (n,) first fixed object down the chain of supports; -1 for none
+    tier: Index  # (n,) tier of ``place``, counted from the top; -1 where ``place`` has none
 
     def part(self, rows: slice) -> Holding:
         """Supports of the objects of ``rows``, which are whole scenes; indices count from their first object."""
@@ -116,15 +97,15 @@ class Holding:
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """M pairs of an object and a thing that may hold it, with heights (m); :meth:`holding` applies a tolerance."""
+    """M pairs of an object and another one that may hold it, with heights (m); :meth:`holding` applies a tolerance."""
 
     shapes: LibraryShapes
     objects: Placed
     upper: Index
     lower: Index
-    gap: Array  # (M, 9) height of the feet above the upper side of the lower thing
+    gap: Array  # (M, 9) height of the feet above the upper side of the lower object
     tier: Index  # (M,) nearest tier from the top, -1 where there are none
-    over: Mask  # (M,) the centre of mass is above the lower thing
+    over: Mask  # (M,) the centre of mass is above the lower object
     above_rim: Array  # (M,) height of the mean foot above the rim of a container; inf where there is none
     above_well: Array  # (M,) height of the mean foot above the container's inside
 
@@ -163,9 +144,9 @@ class Contacts:
         )
 
     def holding(self, tolerance: float = CONTACT) -> Holding:
-        """Supports of objects, where surfaces up to ``tolerance`` (m) apart, or into each other, touch.
+        """Supports of objects; surfaces touch when their gap or overlap is at most ``tolerance`` (m).
 
-        For an object that touches nothing, three times the tolerance is used to find its place and tier alone.
+        Place and tier of an object that touches nothing are found with three times the tolerance.
         """
         support, contained, tier = self._lower(tolerance)
         far, _, far_tier = self._lower(_FAR * tolerance)
@@ -181,7 +162,7 @@ class Contacts:
         return Holding(support, contained, inside, place, np.where(place >= 0, tier[base], -1))
 
     def _lower(self, tolerance: float) -> tuple[Index, Mask, Index]:
-        """The highest thing below each object, whether the object lies in that thing, and the tier; (n,) each."""
+        """The highest object below each object, whether it contains the object, and the tier; (n,) each."""
         size = self.shapes.bounds[self.objects.category[self.lower]]
         thickness = size[:, 1, 2] - size[:, 0, 2]
         into = np.minimum(tolerance, 0.5 * thickness)

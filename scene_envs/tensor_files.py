@@ -23,9 +23,9 @@ def write_tensors(
     """Write tensors to one file, whole or not at all.
 
     Args:
-        path: where to.
-        tensors: by name, on any device.
-        metadata: texts that are kept beside them.
+        path: Path of the file.
+        tensors: Tensors by name, on any device.
+        metadata: Texts by name, kept in the same file.
 
     Raises:
         StorageError: the file cannot be written; nothing is left of it.
@@ -40,7 +40,7 @@ def write_tensors(
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    path.with_name(f"{path.name}.{DIGEST}").unlink(missing_ok=True)  # the digest of the file that was there before
+    path.with_name(f"{path.name}.{DIGEST}").unlink(missing_ok=True)  # the digest of the replaced file
     return path
 
 
@@ -48,13 +48,13 @@ def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[
     """Tensors and metadata of a file, on the CPU; a file of earlier versions, without a digest, is read as it is.
 
     Raises:
-        FileNotFoundError: there is none.
-        CorruptFileError: it is truncated, no safetensors file, or not what was written.
+        FileNotFoundError: the file does not exist.
+        CorruptFileError: the file is truncated, no safetensors file, or was changed.
     """
     from safetensors import SafetensorError, safe_open
 
     path = Path(path)
-    check_beside(path)
+    check_digest_file(path)
     try:
         with safe_open(path, "pt") as file:
             metadata = dict(file.metadata() or {})
@@ -71,17 +71,17 @@ def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[
     return tensors, metadata
 
 
-def check_beside(path: Path) -> None:
-    """Verify a file against the digest in the file ``<name>.sha256`` beside it, if there is one.
+def check_digest_file(path: Path) -> None:
+    """Verify a file against the digest in the file ``<name>.sha256`` in its folder, if there is one.
 
     Raises:
-        CorruptFileError: they do not agree.
+        CorruptFileError: the digests differ.
     """
-    beside = path.with_name(f"{path.name}.{DIGEST}")
-    if not beside.is_file() or not path.is_file():
+    digest_file = path.with_name(f"{path.name}.{DIGEST}")
+    if not digest_file.is_file() or not path.is_file():
         return
     found = hashlib.sha256(path.read_bytes()).hexdigest()
-    if found not in beside.read_text(encoding="utf-8", errors="replace").split():
+    if found not in digest_file.read_text(encoding="utf-8", errors="replace").split():
         raise CorruptFileError(_changed(path))
 
 
@@ -94,7 +94,7 @@ def _in_order(content: bytes) -> bytes:
 
 
 def tensors_digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> str:
-    """SHA-256 of tensors on the CPU, by name, and of texts beside them."""
+    """SHA-256 of tensors on the CPU, by name, and of their metadata."""
     import torch
 
     digest = hashlib.new(DIGEST, json.dumps(sorted((metadata or {}).items())).encode())

@@ -66,18 +66,18 @@ def bounds_of(parts: Sequence[ConvexPart]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Asset:
-    """One model of the library. Frame: z up, base at z = 0 unless the notes of its recipe say otherwise.
+    """One model of the library. Frame: z up, base at z = 0 unless its recipe has another frame.
 
     Attributes:
-        name: identifier, such as ``"steamer_lid"``.
-        display_name: what prompts call it, such as ``"steamer lid"``.
-        plural: plural of the display name.
-        mass: kg; 0 for static assets.
-        center_of_mass: (3,) m in the asset frame.
-        inertia: (3, 3) kg m^2 about the centre of mass, asset axes.
-        visual: coloured mesh for pictures (m).
-        fine: convex parts that keep hollows hollow.
-        coarse: fewer convex parts, used where the result is the same.
+        name: Identifier, such as ``"steamer_lid"``.
+        display_name: Name in prompts, such as ``"steamer lid"``.
+        plural: Plural of the display name.
+        mass: Mass, kg; 0 for static assets.
+        center_of_mass: (3,) centre of mass in the asset frame, m.
+        inertia: (3, 3) inertia about the centre of mass, asset axes, kg m^2.
+        visual: Coloured mesh for pictures, m.
+        fine: Convex parts that keep hollows hollow.
+        coarse: Fewer convex parts, used where the result is the same.
         color: (r, g, b) in 0..255, the class colour of semantic renders.
         static: True for tables, shelves and floors.
     """

@@ -1,4 +1,4 @@
-"""Groups of assets of a kind, such as edible things, and the registry that they enter."""
+"""Registry of groups of assets of one kind, such as edible assets."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def categories_of(names: Sequence[str], library: AssetLibrary) -> tuple[int, ...
     """Categories of ``library`` that ``names`` stand for, ascending.
 
     Args:
-        names: asset names, display names of prompts ("steamer lid") or groups of :data:`ASSET_GROUPS`.
-        library: the assets of a scene type.
+        names: Asset names, display names in prompts ("steamer lid") or groups of :data:`ASSET_GROUPS`.
+        library: Assets of a scene type.
 
     Raises:
         UnknownNameError: a name is none of these; the nearest known one is offered.

@@ -15,7 +15,7 @@ _known_folders: dict[str, None] = {}
 
 
 def know_folders(folders: Sequence[str | os.PathLike[str]]) -> None:
-    """Let :func:`get_library` find the assets of these folders by name alone, after the built-in ones."""
+    """Make :func:`get_library` search these folders too, after the built-in assets."""
     _known_folders.update(dict.fromkeys(map(str, folders)))
 
 
@@ -23,9 +23,9 @@ def get_library(names: Sequence[str], folders: Sequence[str | os.PathLike[str]] 
     """The assets called ``names``, in this order; each is built once per process.
 
     Args:
-        names: asset names in category order.
-        folders: of users' own assets, searched in this order before the built-in ones. The folders of registered scene
-            types are searched after them.
+        names: Asset names in category order.
+        folders: Folders of users' own assets, searched in this order before the built-in ones. The folders of
+            registered scene types are searched last.
 
     Raises:
         UnknownNameError: neither a folder nor a recipe has that name; the nearest known one is offered.

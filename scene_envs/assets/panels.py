@@ -1,6 +1,6 @@
 """Coloured surfaces: boxes with patterns on their faces, lofts through sections, and moved meshes.
 
-A pattern is a list of patches; the face is cut along their edges, so nothing overlaps and nothing flickers.
+A pattern is a list of patches; the face is cut along their edges, so that no triangles overlap.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ def painted_face(
     """A rectangle with patches on it; later patches cover earlier ones.
 
     Args:
-        corner: (3,) m, the lower left corner.
-        along: (3,) m, from there to the lower right corner.
-        up: (3,) m, from there to the upper left corner; ``along x up`` points outward.
-        color: colour of the background.
-        patches: what is painted on it.
+        corner: (3,) lower left corner, m.
+        along: (3,) vector from there to the lower right corner, m.
+        up: (3,) vector from there to the upper left corner, m; ``along x up`` points outward.
+        color: Colour of the background.
+        patches: Patches painted on the rectangle.
     """
     start, right, rise = (np.asarray(v, dtype=np.float64) for v in (corner, along, up))
     across = np.unique(np.clip([0.0, 1.0, *(e for p in patches for e in (p.left, p.right))], 0.0, 1.0))
@@ -91,14 +91,14 @@ def painted_box(
     base: tuple[float, float, float] = (0.0, 0.0, 0.0),
     front: Literal["-y", "+x"] = "-y",
 ) -> trimesh.Trimesh:
-    """An axis-aligned box with a colour, and perhaps a pattern, per face.
+    """An axis-aligned box with a colour, and optionally a pattern, per face.
 
     Args:
-        size: (x, y, z) m.
-        color: one colour, or one per face (all six).
-        art: patches per face.
-        base: centre of the bottom face, m.
-        front: the side from which the top is seen upright.
+        size: (x, y, z) side lengths, m.
+        color: One colour, or one per face (all six).
+        art: Patches per face.
+        base: Centre of the bottom face, m.
+        front: Side from which the top is seen upright.
     """
     colors = color if isinstance(color, Mapping) else dict.fromkeys(FACES, color)
     x, y, z = np.diag(np.asarray(size, dtype=np.float64))

@@ -1,4 +1,4 @@
-"""Recipes: functions that model one built-in asset each, and the registry that they enter."""
+"""Registry of recipes: functions that model one built-in asset each."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Model:
     """Result of a recipe: geometry in the asset frame, m.
 
     Attributes:
-        visual: coloured mesh.
-        fine: convex parts that keep hollows hollow; they may touch, and should not overlap.
-        coarse: fewer parts, without hollows.
+        visual: Coloured mesh.
+        fine: Convex parts that keep hollows hollow; they may touch, and should not overlap.
+        coarse: Fewer parts, without hollows.
     """
 
     visual: trimesh.Trimesh
@@ -52,11 +52,11 @@ def asset_recipe(
     """Register the decorated function as the recipe of asset ``name``.
 
     Args:
-        name: identifier, unique in the library.
-        display_name: what prompts call it.
-        mass: kg; 0 makes the asset static.
-        color: (r, g, b) class colour of semantic renders.
-        plural: plural of the display name; the regular one by default.
+        name: Identifier, unique in the library.
+        display_name: Name in prompts.
+        mass: Mass, kg; 0 makes the asset static.
+        color: Class colour (r, g, b) of semantic renders.
+        plural: Plural of the display name; the regular one by default.
 
     Raises:
         InvalidInputError: the name is taken, or the mass is negative.

@@ -1,6 +1,6 @@
 """Convex parts from a few numbers: boxes, solids of revolution, rings of wedges, rods; and their mass.
 
-All lengths are metres, all points are in the asset frame (z up). Round things are regular polygons whose
+All lengths are metres, all points are in the asset frame (z up). Circles are regular polygons whose
 corners lie on the nominal circle, so that a diameter is the distance between opposite corners.
 """
 
@@ -76,9 +76,9 @@ def solid(profile: Profile, segments: int, phase: float = 0.0) -> ConvexPart:
     """The convex hull of a half section revolved about z: cylinders, frusta, convex bodies.
 
     Args:
-        profile: points (r, z), m; r = 0 gives a single point.
-        segments: corners of the polygon that stands for a circle.
-        phase: angle of the first corner, rad.
+        profile: Points (r, z), m; r = 0 gives a single point.
+        segments: Number of corners of the polygon that replaces a circle.
+        phase: Angle of the first corner, rad.
 
     >>> cylinder = solid([(0.1, 0.0), (0.1, 0.2)], 16)
     >>> len(cylinder.vertices), cylinder.bounds[1].round(3).tolist()
@@ -95,9 +95,9 @@ def ring(profile: Profile, segments: int, phase: float = 0.0) -> list[ConvexPart
     """A convex section swept about z as ``segments`` wedges that touch and do not overlap.
 
     Args:
-        profile: corners (r, z) of a convex section with r > 0, m.
-        segments: number of wedges.
-        phase: angle of the first joint, rad.
+        profile: Corners (r, z) of a convex section with r > 0, m.
+        segments: Number of wedges.
+        phase: Angle of the first joint, rad.
 
     >>> walls = ring([(0.10, 0.0), (0.12, 0.0), (0.12, 0.09), (0.10, 0.09)], 16)
     >>> len(walls), len(walls[0].vertices)
@@ -119,8 +119,8 @@ def rods(path: Sequence[tuple[float, float, float]], width: float, thickness: fl
 
     Args:
         path: P points (x, y, z), m, all with the same y.
-        width: size along y, m.
-        thickness: size across the path in the x-z plane, m.
+        width: Size along y, m.
+        thickness: Size across the path in the x-z plane, m.
 
     Returns:
         P - 1 parts; neighbours share their end faces, cut along the bisector (mitred).

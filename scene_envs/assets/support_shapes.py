@@ -26,34 +26,20 @@ _LEVEL = 0.005
 
 @dataclass(frozen=True, eq=False)
 class LibraryShapes:
-    """Shapes of C assets as padded arrays, in asset frames, m.
+    """Shapes of C assets as padded arrays, in asset frames, m."""
 
-    Attributes:
-        points: (C, 3, V) extreme points.
-        center: (C, 3) centre of mass.
-        bounds: (C, 2, 3) lowest and highest corner.
-        top: (C, G, G) height of the upper side per cell; -inf where there is nothing.
-        wide: (C, G, G) the same, widened by about a centimetre.
-        covered: (C, G, G) bool, the widened outline with its holes filled.
-        low: (C, 2) corner of the maps; ``cell`` (C, 2): size of a cell.
-        rim: (C,) height of the lowest way out of a container; -inf for what is no container.
-        well: (C,) height of the bottom of a container.
-        tiers: (C, L) heights of tiers from the top, NaN beyond their number; assets with fewer than two have none.
-        static: (C,) bool.
-    """
-
-    points: Array
-    center: Array
-    bounds: Array
-    top: Array
-    wide: Array
-    covered: Mask
-    low: Array
-    cell: Array
-    rim: Array
-    well: Array
-    tiers: Array
-    static: Mask
+    points: Array  # (C, 3, V) extreme points
+    center: Array  # (C, 3) centre of mass
+    bounds: Array  # (C, 2, 3) lowest and highest corner
+    top: Array  # (C, G, G) height of the upper side per cell; -inf outside the asset
+    wide: Array  # (C, G, G) height of the upper side, widened by about a centimetre
+    covered: Mask  # (C, G, G) bool, the widened outline with its holes filled
+    low: Array  # (C, 2) lowest corner of the maps
+    cell: Array  # (C, 2) size of a cell
+    rim: Array  # (C,) height of the lowest way out of a container; -inf for other assets
+    well: Array  # (C,) height of the bottom of a container
+    tiers: Array  # (C, L) heights of tiers from the top, NaN beyond their number; assets with fewer than two have none
+    static: Mask  # (C,) bool
 
     def cells(self, category: Index, points: Array) -> tuple[Index, ...]:
         """Indices (category, i, j) of asset-frame ``points`` (..., 3) into the maps; cells at the edge are empty."""
@@ -113,7 +99,7 @@ def _maps(asset: Asset) -> _Maps:
 
 
 def _upper_side(part: ConvexPart, grid: Array) -> Array:
-    """(G, G): height of a convex part above each point of ``grid`` (G, G, 2); -inf beside it."""
+    """(G, G): height of a convex part above each point of ``grid`` (G, G, 2); -inf outside it."""
     corners = part.vertices[part.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
@@ -123,8 +109,8 @@ def _upper_side(part: ConvexPart, grid: Array) -> Array:
     up, down = normals[:, 2] > 1e-6, normals[:, 2] < -1e-6
     high = (slack[..., up] / normals[up, 2]).min(axis=-1)
     low = (slack[..., down] / normals[down, 2]).max(axis=-1)
-    beside = (slack[..., ~(up | down)] < -1e-9).any(axis=-1)
-    return np.where((high >= low - 1e-9) & ~beside, high, -np.inf)
+    outside = (slack[..., ~(up | down)] < -1e-9).any(axis=-1)
+    return np.where((high >= low - 1e-9) & ~outside, high, -np.inf)
 
 
 def _extreme_points(parts: Iterable[ConvexPart]) -> Array:

@@ -68,12 +68,12 @@ def lathe(
     """Revolve an open or closed polyline of P points about z.
 
     Args:
-        profile: points (r, z), m. The outside is on the right when walking along it: go up on the outside of
-            a vessel, down on its inside.
-        colors: one colour, or one per span (P - 1).
-        segments: facets around.
-        phase: angle of the first corner, rad.
-        flat: facets stay visible (square dishes).
+        profile: Points (r, z), m, with the outside on the right: upward on the outside of a vessel, downward on its
+            inside.
+        colors: One colour, or one per span (P - 1).
+        segments: Number of facets around the axis.
+        phase: Angle of the first corner, rad.
+        flat: Whether facets stay visible (square dishes).
     """
     points = np.asarray(profile, dtype=np.float64)
     steps = np.diff(points, axis=0)
@@ -111,7 +111,7 @@ def _span(
 
 
 def tube(path: ArrayLike, radii: ArrayLike, color: Color, *, sides: int = 10) -> trimesh.Trimesh:
-    """A round tube along a path (P, 3) in the x-z plane, with flat end caps; ``radii`` one, or one per point."""
+    """A round tube along a path (P, 3) in the x-z plane, with flat end caps; ``radii`` is one, or one per point."""
     points = np.asarray(path, dtype=np.float64)
     size = np.broadcast_to(np.asarray(radii, dtype=np.float64), (len(points),))
     tangents = np.gradient(points, axis=0)

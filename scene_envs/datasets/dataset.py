@@ -35,9 +35,9 @@ class SceneDataset:
     Attributes:
         tensor: (M, N, D) float32, raw (metres, rotation entries, one-hot).
         prompts: M prompts, the first of each scene.
-        normalizer: the normalizer the files were written with.
-        scene_type: the scene type.
-        metadata: the content of ``metadata.json``.
+        normalizer: Normalizer of the files.
+        scene_type: Scene type of the scenes.
+        metadata: Content of ``metadata.json``.
         prompt_sets: M tuples, all prompts of each scene, the one in ``prompts`` first.
 
     >>> scenes = SceneBatch.empty("dimsum_table", 10)
@@ -84,15 +84,15 @@ class SceneDataset:
         that are finished, with a warning (see :attr:`complete`).
 
         Args:
-            path: folder of ``.parquet`` or ``.arrow`` files, one such file, or a folder that Hugging Face's
+            path: Folder of ``.parquet`` or ``.arrow`` files, one such file, or a folder that Hugging Face's
                 ``Dataset.save_to_disk`` wrote.
-            scene_type: overrides the scene type named in the metadata (datasets of others name none).
-            aliases: model path, or its stem, to asset name, for datasets with other asset names.
-            limit: read at most this many scenes.
-            metadata: ``metadata.json``, when it is neither beside the files nor in the folder above.
-            fixed_tolerance: how far (m, rotation entries) fixed objects may stand from the scene type's pose; they are
-                then put at that pose. ``math.inf`` accepts any.
-            slots: N of the scenes, at least the files'; None takes the files'.
+            scene_type: Scene type; None takes the one named in the metadata (datasets of others name none).
+            aliases: Mapping of model paths, or their stems, to asset names, for datasets with other asset names.
+            limit: Largest number of scenes to read.
+            metadata: Path of ``metadata.json``, when it is neither in the folder of the files nor in the folder above.
+            fixed_tolerance: Largest distance (m, rotation entries) of fixed objects from the scene type's pose, which
+                they then get. ``math.inf`` accepts any pose.
+            slots: N of the scenes, at least that of the files; None takes that of the files.
 
         Raises:
             InvalidInputError: nothing there, no scene type given or named, or a fixed object stands elsewhere.
@@ -106,8 +106,8 @@ class SceneDataset:
         own = metadata is None and (Path(path) / store.METADATA).is_file()
         if own and not dataset.complete and (limit is None or len(dataset) < limit):
             logger.warning(
-                "%r holds %d of the %d scenes that were to be made: shards are missing, or are still being generated; "
-                "the scene-envs generate command that made it, given again, makes the rest",
+                "%r holds %d of the %d requested scenes: shards are missing, or are still being generated; "
+                "run the same scene-envs generate command again to make the rest",
                 str(path),
                 len(dataset),
                 int(dataset.metadata["count"]),
@@ -170,12 +170,12 @@ class SceneDataset:
 
     @property
     def complete(self) -> bool:
-        """Whether all scenes that were asked for are here (True for datasets without a ``count`` in their metadata)."""
+        """Whether all requested scenes are here (True for datasets without a ``count`` in their metadata)."""
         return len(self) >= int(self.metadata.get("count") or 0)
 
     @property
     def keys(self) -> NDArray[np.uint64]:
-        """(M,): equal for rows that hold the same scene; see :func:`~scene_envs.datasets.layout.scene_keys`."""
+        """(M,) keys, equal for rows of the same scene; see :func:`~scene_envs.datasets.layout.scene_keys`."""
         return scene_keys(self.tensor)
 
     def __len__(self) -> int:
@@ -194,7 +194,7 @@ class SceneDataset:
     def split(self, fractions: Sequence[float], seed: int = 0) -> tuple[SceneDataset, ...]:
         """Disjoint random parts of the given sizes; fractions may sum to less than one.
 
-        Rows that repeat a scene (with another prompt) come into the same part. When a dataset grows, scenes change
+        Rows that repeat a scene (with another prompt) belong to the same part. When a dataset grows, scenes change
         parts; :meth:`stable_split` keeps each scene in its part.
 
         Raises:

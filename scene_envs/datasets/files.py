@@ -24,38 +24,23 @@ BLOCK = 2000
 
 @dataclass(frozen=True)
 class Block:
-    """A run of rows of one file: the unit that is read at a time.
+    """A run of rows of one file: the unit that is read at a time."""
 
-    Attributes:
-        file: parquet or arrow.
-        start: its first row.
-        rows: how many.
-        group: row group of a parquet file that holds it; -1 for arrow.
-        skip: rows of the group before the block.
-    """
-
-    file: Path
-    start: int
-    rows: int
-    group: int = -1
-    skip: int = 0
+    file: Path  # parquet or arrow file
+    start: int  # first row of the block
+    rows: int  # number of rows
+    group: int = -1  # row group of a parquet file that holds the block; -1 for arrow
+    skip: int = 0  # number of rows of the group before the block
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows as they stand in a file.
+    """Rows of a file, unchanged."""
 
-    Attributes:
-        scenes: (M, N, D) float32 or float64, normalised.
-        prompt_sets: M tuples of prompts, at least one each.
-        place: the file (for messages).
-        start: row of the first scene in it.
-    """
-
-    scenes: NDArray[np.floating]
-    prompt_sets: list[tuple[str, ...]]
-    place: str
-    start: int
+    scenes: NDArray[np.floating]  # (M, N, D) float32 or float64, normalised
+    prompt_sets: list[tuple[str, ...]]  # M tuples of prompts, at least one each
+    place: str  # name of the file, for messages
+    start: int  # row of the first scene in the file
 
 
 def find_files(path: str | os.PathLike[str]) -> list[Path]:
@@ -65,8 +50,8 @@ def find_files(path: str | os.PathLike[str]) -> list[Path]:
     ``datasets.Dataset.save_to_disk`` wrote.
 
     Raises:
-        InvalidInputError: nothing to read there.
-        CorruptFileError: ``state.json`` cannot be read, or names files that are not there.
+        InvalidInputError: there are no such files.
+        CorruptFileError: ``state.json`` cannot be read, or names missing files.
     """
     path = Path(path)
     if path.is_file():
@@ -89,7 +74,7 @@ def find_files(path: str | os.PathLike[str]) -> list[Path]:
 def find_metadata(path: str | os.PathLike[str]) -> Path:
     """``metadata.json`` in the folder of a dataset or file, or in the folder above (splits share one).
 
-    Where there is none, this is the place that it should have.
+    Without such a file, the result is its expected path in the folder.
     """
     path = Path(path)
     folder = path if path.is_dir() else path.parent
@@ -112,11 +97,7 @@ def list_blocks(file: Path) -> list[Block]:
 
 
 def read_block(block: Block, features: int) -> Rows:
-    """The rows of a block.
-
-    Args:
-        block: one of :func:`list_blocks`.
-        features: D, the length of a slot in the file.
+    """The rows of a block whose slots have ``features`` features (D) in the file.
 
     Raises:
         CorruptFileError: it cannot be read, columns are missing, or scenes have another width or gaps.
@@ -158,9 +139,6 @@ def to_rows(table: pa.Table, features: int, place: str, start: int = 0) -> Rows:
     return Rows(scenes, prompt_sets, place, start)
 
 
-# -- files --------------------------------------------------------------------------------------------
-
-
 def _saved_files(folder: Path) -> list[Path]:
     path = folder / _STATE
     try:
@@ -169,7 +147,7 @@ def _saved_files(folder: Path) -> list[Path]:
         raise CorruptFileError(f"{str(path)!r} does not list the data files of a saved dataset: {error}") from error
     missing = [name for name in names if not (folder / name).is_file()]
     if missing:
-        raise CorruptFileError(f"{str(path)!r} lists files that are not there: {missing}")
+        raise CorruptFileError(f"{str(path)!r} lists missing files: {missing}")
     return [folder / name for name in names]
 
 
@@ -206,9 +184,6 @@ def _within_group(batches: Iterator[pa.RecordBatch], block: Block) -> pa.Table:
         if seen >= block.skip + block.rows:
             break
     return pa.Table.from_batches(parts)
-
-
-# -- columns ------------------------------------------------------------------------------------------
 
 
 def _columns(names: Sequence[str], place: str) -> list[str]:

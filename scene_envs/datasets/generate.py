@@ -36,11 +36,11 @@ class GenerationReport:
     """Result of a generation.
 
     Attributes:
-        output: the dataset folder.
-        scenes: scenes in it.
-        tried: scenes that the grammar built, those rejected by physics included.
-        reasons: rejected structures and scenes by reason, most frequent first.
-        seconds: wall time of this call; short when a run was resumed.
+        output: Dataset folder.
+        scenes: Number of scenes in the folder.
+        tried: Number of scenes that the grammar built, those rejected by physics included.
+        reasons: Numbers of rejected structures and scenes by reason, most frequent first.
+        seconds: Wall time of this call, without that of an earlier, interrupted run.
     """
 
     output: Path
@@ -65,21 +65,21 @@ def generate(
 ) -> GenerationReport:
     """Write ``count`` scenes with three prompts each into the folder ``output``.
 
-    Each shard depends on (grammar, seed, shard index) alone, so the result does not depend on the number of workers or
-    on where they run. A run killed at any point gives the same files when it is started again. Finished shards are
-    kept, and the verdicts of an unfinished shard are reused (with Ray an unfinished shard begins anew).
+    Each shard depends on (grammar, seed, shard index) alone, so the result depends neither on the number of workers nor
+    on their machines. A run killed at any point gives the same files when it is started again. Finished shards are
+    kept, and the verdicts of an unfinished shard are reused (with Ray an unfinished shard is made again).
 
     Args:
-        scene_type: name of a grammar (built-in ones are called like their scene type).
-        count: scenes to write.
-        output: folder; made when missing.
-        seed: any non-negative integer.
-        workers: spawned processes; 0 runs in this one. With Ray: CPUs of the cluster that is started here.
-        verify: keep only scenes that pass :func:`~scene_envs.datasets.verification.verify_scenes`.
-        shard_size: scenes per parquet file.
-        progress: show a live progress bar (a line every 30 s where there is no terminal).
+        scene_type: Name of a grammar (built-in ones are called like their scene type).
+        count: Number of scenes to write.
+        output: Dataset folder; made when missing.
+        seed: Seed of all random numbers, not negative.
+        workers: Number of spawned processes; 0 runs in this one. With Ray: CPUs of the cluster that is started here.
+        verify: Whether to keep only scenes that pass :func:`~scene_envs.datasets.verification.judge_scenes`.
+        shard_size: Number of scenes per parquet file.
+        progress: Whether to show a live progress bar (a line every 30 s where there is no terminal).
         backend: ``"processes"`` of this machine, or ``"ray"``.
-        address: of a running Ray cluster; None starts one on this machine.
+        address: Address of a running Ray cluster; None starts one on this machine.
 
     Raises:
         InvalidInputError: a bad argument, ``output`` holds a dataset made with other settings, or workers cannot import
@@ -232,7 +232,7 @@ def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normal
 
 
 def _is_made(job: Job) -> bool:
-    """Whether the shard is there; raises CorruptFileError when it is damaged or has another number of scenes."""
+    """Whether the shard exists; raises CorruptFileError when it is damaged or has another number of scenes."""
     path = Path(job.path)
     if not path.is_file():
         return False

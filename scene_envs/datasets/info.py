@@ -1,4 +1,4 @@
-"""Contents of ``metadata.json``, readable without the dataset."""
+"""Reader of ``metadata.json``, which needs no other file of the dataset."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class DatasetInfo:
     """The content of one ``metadata.json``.
 
     Attributes:
-        path: the file.
+        path: Path of the file.
         model_paths: C paths; the position of a path is its category *in the files*, C is empty.
-        normalizer: of the files, D = 3 + 9 + C + 1 features in the files' order.
-        welded_model_paths: paths of the assets that are welded.
-        slots: N, slots per scene; None when the file does not say.
-        scene_type: name of the scene type; None in datasets of others.
-        count: scenes that were asked for; None when the file does not say.
-        metadata: all keys but the digest, as they stand in the file.
+        normalizer: Normalizer of the files, with D = 3 + 9 + C + 1 features in the files' order.
+        welded_model_paths: Paths of the welded assets.
+        slots: N, the number of slots per scene; None when the file does not say.
+        scene_type: Name of the scene type; None in datasets of others.
+        count: Number of requested scenes; None when the file does not say.
+        metadata: All keys of the file but the digest.
     """
 
     path: Path
@@ -58,8 +58,8 @@ class DatasetInfo:
         """(C + 1,) int64: the category of ``scene_type`` for each category of the files; empty maps to empty.
 
         Args:
-            scene_type: whose categories are wanted; it may have assets that the files lack.
-            aliases: model path, or its stem, to asset name.
+            scene_type: Scene type of the result; it may have assets that the files lack.
+            aliases: Mapping of model paths, or their stems, to asset names.
 
         Raises:
             UnknownNameError: a model path that is no asset of the scene type.
@@ -67,7 +67,7 @@ class DatasetInfo:
         aliases = aliases or {}
         found = []
         for path, stem in zip(self.model_paths, self.stems, strict=True):
-            whole = Path(path).name  # our paths have no suffix, but a name may hold a dot
+            whole = Path(path).name  # paths of this package have no suffix, but a name may hold a dot
             name = aliases.get(path, aliases.get(stem, whole if whole in scene_type.assets else stem))
             if name not in scene_type.assets:
                 kind = f"asset of {scene_type.name!r} (model path {path!r} in {str(self.path)!r}; pass aliases=)"
@@ -86,7 +86,7 @@ def read_metadata(path: str | os.PathLike[str]) -> DatasetInfo:
     """
     file = Path(path) / METADATA if Path(path).is_dir() else Path(path)
     if not file.is_file():
-        raise InvalidInputError(f"no {METADATA} at {str(file)!r}; a dataset folder holds one beside its files")
+        raise InvalidInputError(f"no {METADATA} at {str(file)!r}; a dataset folder holds one")
     try:
         metadata = json.loads(file.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
@@ -132,7 +132,7 @@ def _whole(metadata: dict[str, Any], key: str) -> int | None:
 
 
 def _whole_slot(normalizer: Normalizer, one_hot: int, file: Path) -> Normalizer:
-    """The normalizer of all features of a slot; one of the pose alone is extended to leave one-hots as they are."""
+    """The normalizer of a whole slot; a pose-only one is extended by the identity on the one-hot features."""
     vectors = (normalizer.scale, normalizer.min, normalizer.input_min, normalizer.input_max)
     lengths = {len(vector) for vector in vectors}
     if lengths == {POSE_FEATURES}:

@@ -11,12 +11,9 @@ from scene_envs.files import storage_error
 class Journal:
     """An append-only text file with the number of a candidate and its verdict per line.
 
-    A process may be killed while it writes, so a last line without its end is dropped. Two processes that make the same
-    shard may write by turns, because a worker may outlive its killed parent for a moment; a verdict that is written
-    twice counts once.
-
-    Args:
-        path: the file; made by the first :meth:`append`.
+    A process may be killed while it writes, so an incomplete last line is dropped. Two processes that make the same
+    shard may write by turns, because a worker may outlive its killed parent for a moment; a verdict that is
+    written twice counts once. The first :meth:`append` makes the file.
     """
 
     def __init__(self, path: Path) -> None:

@@ -33,12 +33,12 @@ class Layout:
     """Conversion of the files of one dataset to scenes of a scene type.
 
     Attributes:
-        info: of the files.
-        scene_type: of the scenes.
-        aliases: model path, or its stem, to asset name.
-        fixed_tolerance: how far (m, rotation entries) a fixed object may stand from the scene type's pose; the object
-            is then put at that pose. ``math.inf`` accepts any pose.
-        slots: N of the scenes; None takes as many as the file has.
+        info: Metadata of the files.
+        scene_type: Scene type of the scenes.
+        aliases: Mapping of model paths, or their stems, to asset names.
+        fixed_tolerance: Largest distance (m, rotation entries) of a fixed object from the scene type's pose, which it
+            then gets. ``math.inf`` accepts any pose.
+        slots: N of the scenes; None takes that of the file.
     """
 
     info: DatasetInfo
@@ -54,7 +54,7 @@ class Layout:
     def normalizer(self) -> Normalizer:
         """The files' normalizer with features in the order of the scene type.
 
-        Assets that the files lack, or that several of their paths stand for, are scaled as *empty* is.
+        Assets without a path in the files, or with several, are scaled like *empty*.
         """
         found: Tensor = self._categories  # type: ignore[attr-defined]
         order = torch.full((self.scene_type.num_assets + 1,), len(self.info.model_paths))
@@ -76,12 +76,12 @@ class Layout:
         if not len(values):
             slots = self.scene_type.slots if self.slots is None else self.slots
             return torch.empty(0, slots, self.scene_type.features)
-        _check(~torch.isfinite(values).all(dim=-1), rows, "holds a value that is not finite")
+        _require_none(~torch.isfinite(values).all(dim=-1), rows, "holds a value that is not finite")
         raw = self.info.normalizer.unnormalize(values)
         one_hot = raw[..., CATEGORY]
         found = one_hot.argmax(dim=-1)
         exact = torch.nn.functional.one_hot(found, one_hot.shape[-1])
-        _check((one_hot - exact).abs().amax(dim=-1) > _ONE_HOT, rows, "is not one-hot over the assets and empty")
+        _require_none((one_hot - exact).abs().amax(dim=-1) > _ONE_HOT, rows, "is not one-hot over the assets and empty")
         categories = self._categories[found]  # type: ignore[attr-defined]
         empty = self.scene_type.num_assets
         rotations = self._rotations(raw[..., ROTATION].unflatten(-1, (3, 3)), categories != empty, rows)
@@ -94,7 +94,7 @@ class Layout:
         gram = matrices.transpose(-1, -2) @ matrices
         error = (gram - torch.eye(3, dtype=gram.dtype)).abs().amax(dim=(-1, -2)) * present
         flipped = present & (torch.linalg.det(matrices) < 0)
-        _check((error > _ROTATION) | flipped, rows, "has no rotation matrix in its features 3 to 11")
+        _require_none((error > _ROTATION) | flipped, rows, "has no rotation matrix in its features 3 to 11")
         loose = error > 1e-5
         if not bool(loose.any()):
             return matrices
@@ -110,9 +110,9 @@ def place_fixed(batch: SceneBatch, tolerance: float, place: str = "the batch", s
 
     Args:
         batch: B scenes, fixed objects in any slot.
-        tolerance: how far (m, rotation entries) they may stand from their poses.
-        place: where the scenes come from (for messages).
-        start: row of the first scene there (for messages).
+        tolerance: Largest distance (m, rotation entries) of fixed objects from their poses.
+        place: Source of the scenes, for messages.
+        start: Row of the first scene in the source, for messages.
 
     Raises:
         InvalidInputError: a fixed object stands elsewhere, or is missing from a scene without an empty slot.
@@ -163,8 +163,8 @@ def _fixed_row(fixed: FixedObject, scene_type: SceneType) -> Tensor:
     return row
 
 
-def _check(bad: Tensor, rows: Rows, what: str) -> None:
-    """``bad`` (M, N) marks slots that cannot be read."""
+def _require_none(bad: Tensor, rows: Rows, what: str) -> None:
+    """Raise CorruptFileError for the first slot marked in ``bad`` (M, N)."""
     if bool(bad.any()):
         row, slot = torch.nonzero(bad)[0].tolist()
         raise CorruptFileError(f"row {rows.start + row} of {rows.place!r}, slot {slot}, {what}")
@@ -173,7 +173,7 @@ def _check(bad: Tensor, rows: Rows, what: str) -> None:
 def scene_keys(tensor: Tensor) -> NDArray[np.uint64]:
     """(M,) keys of raw scenes (M, N, D): equal for the same objects in the same poses, in any order of slots.
 
-    Rows of a dataset that repeat a scene with another prompt share one key. The poses must be equal to the last bit.
+    Rows of a dataset that repeat a scene with another prompt share one key. The poses must be bit-equal.
     """
     chunks = [_chunk_keys(chunk) for chunk in tensor.split(_KEYS_AT_ONCE)]
     return np.concatenate(chunks) if chunks else np.empty(0, dtype=np.uint64)

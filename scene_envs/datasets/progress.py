@@ -1,4 +1,4 @@
-"""Progress of a generation: scenes per second, and why scenes were dropped."""
+"""Progress of a generation: scenes per second, and reasons for dropped scenes."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _EVERY = 30.0
 def generation_progress(title: str, done: int, count: int, show: bool) -> Iterator[Report]:
     """A live bar with scenes/s and the most frequent reasons; yields the function that advances it.
 
-    On a terminal the bar stands on stderr; elsewhere (a log file) a line is printed every 30 s.
+    On a terminal the bar is on stderr; elsewhere (a log file) a line is printed every 30 s.
 
     Args:
-        title: what is made.
-        done: scenes that are there already.
-        count: scenes that are wanted.
-        show: whether to show anything.
+        title: Title of the bar.
+        done: Number of scenes that exist already.
+        count: Number of requested scenes.
+        show: Whether to show anything.
     """
     totals: Counter[str] = Counter()
     kept = 0

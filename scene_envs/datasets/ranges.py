@@ -1,4 +1,4 @@
-"""Fixed normalizer of a generated dataset, known before the first scene, so that all shards share it."""
+"""Fixed normalizer of a generated dataset, computed before the first scene, so that all shards share it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from scene_envs.normalizer import Normalizer
 from scene_envs.scene import CATEGORY
 
 _OBJECTS = 10_000
-"""Least number of objects in a sample in which all stand upright, unless that takes more than ``_SCENES`` scenes."""
+"""Smallest number of objects in a sample without tilted objects, unless it takes more than ``_SCENES`` scenes."""
 _SCENES = 4096
 _STEP = 128
-"""Scenes drawn at a time; no more are drawn once a tilted object was seen."""
+"""Scenes drawn at a time, until one holds a tilted object."""
 _SEED = 20_250_101
 _UPRIGHT = 1e-6
 """A rotation entry that encodes tilt counts as zero below this."""

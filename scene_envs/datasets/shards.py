@@ -1,4 +1,4 @@
-"""One shard of a generated dataset, a function of its job and grammar alone."""
+"""Maker of one shard of a generated dataset, which depends on its job and grammar alone."""
 
 from __future__ import annotations
 
@@ -23,31 +23,23 @@ from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
 
 _MAX_CHUNK = 32
-"""Scenes judged at a time at most."""
+"""Largest number of scenes judged at a time."""
 _CHUNK_SECONDS = 0.5
-"""About how long a chunk may take, so that slow grammars report often; chunks do not change the result."""
+"""Approximate time of a chunk, so that slow grammars report often; chunks do not change the result."""
 _MAX_FRUITLESS = 2000
-"""Scenes thrown away in a row before generation stops with an error."""
+"""Number of scenes rejected in a row at which generation stops with an error."""
 _UNFIT = "outside the normalizer"
 
 
 @dataclass(frozen=True)
 class Job:
-    """Specification of one shard.
+    """Specification of one shard."""
 
-    Attributes:
-        index: of the shard.
-        size: scenes in it.
-        seed: of the dataset.
-        verify: keep only scenes that pass :func:`~scene_envs.datasets.verification.judge_scenes`.
-        path: where it goes.
-    """
-
-    index: int
-    size: int
-    seed: int
-    verify: bool
-    path: str
+    index: int  # index of the shard
+    size: int  # number of scenes in the shard
+    seed: int  # seed of the dataset
+    verify: bool  # whether to keep only scenes that pass ``judge_scenes``
+    path: str  # path of the shard's file
 
 
 def make_shard(
@@ -59,13 +51,13 @@ def make_shard(
     ``job.size`` candidates that pass. So neither the size of chunks nor an interruption changes the result.
 
     Args:
-        job: which shard.
-        grammar: what to draw from.
-        normalizer: of the dataset.
-        journal: verdicts of an earlier, interrupted attempt, which are not computed again; None keeps none.
+        job: Specification of the shard.
+        grammar: Grammar that draws the candidates.
+        normalizer: Normalizer of the dataset.
+        journal: Verdicts of an earlier, interrupted attempt, which are not computed again; None keeps none.
 
     Raises:
-        PhysicsError: no candidate passes, over and over.
+        PhysicsError: too many candidates in a row fail.
         StorageError: the journal cannot be written.
     """
     known = journal.read() if journal is not None else []
@@ -80,11 +72,11 @@ def make_shard(
         scenes, drawn = _draw(grammar, job, tried, count)
         digests = [hashlib.blake2b(scene.numpy().tobytes(), digest_size=6).hexdigest() for scene in scenes]
         if ahead > 0:
-            told = [line.partition(" ") for line in known[tried : tried + count]]
-            if [digest for digest, _, _ in told] != digests:  # the grammar has changed since: these are other scenes
+            entries = [line.partition(" ") for line in known[tried : tried + count]]
+            if [digest for digest, _, _ in entries] != digests:  # the grammar has changed since
                 known, ahead = [], 0
         if ahead > 0:
-            verdicts = [verdict for _, _, verdict in told]
+            verdicts = [verdict for _, _, verdict in entries]
         else:
             verdicts = _judge(scenes, grammar, normalizer, job.verify)
             if journal is not None:
@@ -105,7 +97,7 @@ def make_shard(
         yield len(kept) - fresh, tried - first, dict(reasons - before)
         if fruitless >= _MAX_FRUITLESS:
             raise PhysicsError(
-                f"grammar {grammar.name!r}: {fruitless} scenes in a row were thrown away; "
+                f"grammar {grammar.name!r}: {fruitless} scenes in a row were rejected; "
                 f"most frequent reasons: {dict(reasons.most_common(3))}"
             )
         if ahead <= 0:
@@ -118,7 +110,7 @@ def make_shard(
 
 
 def _draw(grammar: Grammar, job: Job, first: int, count: int) -> tuple[Tensor, list[Counter[str]]]:
-    """Candidates ``first`` … ``first + count - 1`` (count, N, D), and why the grammar threw structures away."""
+    """Candidates ``first`` … ``first + count - 1`` (count, N, D), and the grammar's reasons for rejected structures."""
     scenes, reasons = [], []
     for candidate in range(first, first + count):
         grammar.reasons.clear()
@@ -144,6 +136,6 @@ def write_shard(job: Job, grammar: Grammar, normalizer: Normalizer) -> Generator
 
 
 def shard_journal(job: Job) -> Journal:
-    """The journal of a shard, beside its file."""
+    """The journal of a shard, in the folder of its file."""
     path = Path(job.path)
     return Journal(path.with_name(f".{path.name}.journal"))

@@ -23,9 +23,9 @@ class Part:
     part. The fractions are therefore only met on average.
 
     Attributes:
-        fractions: of all parts, in order; they may sum to less than one.
-        index: which part.
-        seed: not negative; another seed makes other parts.
+        fractions: Fractions of all parts, in order; they may sum to less than one.
+        index: Index of this part.
+        seed: Seed of the assignment, not negative.
 
     Raises:
         InvalidInputError: fractions, index or seed are not as described above.
@@ -51,7 +51,7 @@ class Part:
             raise InvalidInputError(f"a part needs seed >= 0, got {self.seed}")
 
     def contains(self, keys: Keys) -> NDArray[np.bool_]:
-        """(M,) bool: which of the scenes with these keys are in this part."""
+        """(M,) bool, True for scenes, given by their keys, that are in this part."""
         draws = mix_bits(keys ^ mix_bits(np.array([self.seed], dtype=np.uint64))) / 2.0**64  # (M,) in [0, 1]
         bounds = list(accumulate(self.fractions, initial=0.0))
         low, high = bounds[self.index], bounds[self.index + 1]
@@ -73,7 +73,7 @@ def split_rows(keys: Keys, fractions: Sequence[float], seed: int) -> list[NDArra
     _, first, group, sizes = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
     shuffled = np.argsort(first)[np.random.default_rng(seed).permutation(len(sizes))]  # groups, in random order
     ends = np.cumsum(sizes[shuffled])
-    position = np.empty(len(sizes), dtype=np.int64)  # of a group's last row in the shuffled order
+    position = np.empty(len(sizes), dtype=np.int64)  # position of a group's last row in the shuffled order
     position[shuffled] = ends
     order = np.argsort(position[group], kind="stable")
     edges = [round(bound * len(keys)) for bound in accumulate(fractions, initial=0.0)]

@@ -29,7 +29,7 @@ PROMPT_SETS = "language_annotations"
 _NOTES = b"scene_envs"
 _MODEL_PATH = "scene_envs/assets/{name}"
 _ROW_GROUP = 500
-"""Scenes per row group, the least that a streaming reader has to hold in memory."""
+"""Scenes per row group, the unit that a streaming reader holds in memory."""
 
 
 def shard_name(index: int) -> str:
@@ -38,7 +38,7 @@ def shard_name(index: int) -> str:
 
 
 def make_metadata(scene_type: SceneType, normalizer: Normalizer, **extra: Any) -> dict[str, Any]:
-    """The content of ``metadata.json`` for a dataset of ``scene_type``; ``extra`` keys are added as they are."""
+    """The content of ``metadata.json`` for a dataset of ``scene_type``, with the ``extra`` keys."""
     return {
         "scene_type": scene_type.name,
         "model_paths": [_MODEL_PATH.format(name=name) for name in scene_type.assets],
@@ -64,10 +64,10 @@ def write_shard(
     """Write one parquet file atomically.
 
     Args:
-        path: where to.
+        path: Path of the file.
         scenes: (M, N, D) float32, normalised.
-        prompt_sets: the prompts of each of the M scenes; ``language_annotations`` is left out when all have one.
-        notes: JSON-able facts kept in the file's footer, such as why scenes were thrown away.
+        prompt_sets: Prompts of each of the M scenes; ``language_annotations`` is left out when all have one.
+        notes: JSON-able facts for the file's footer, such as reasons for rejected scenes.
 
     Raises:
         StorageError: the file cannot be written; nothing is left of it.
@@ -103,7 +103,7 @@ def read_notes(path: Path) -> dict[str, Any]:
         notes = without_digest(json.loads(footer.get(_NOTES, b"{}")), path)
         rows = file.metadata.num_rows
         if notes.get("rows", rows) != rows:
-            raise ValueError(f"{notes['rows']} rows were written, {rows} are there")
+            raise ValueError(f"{notes['rows']} rows were written, the file has {rows}")
         return {**notes, "rows": rows}
     except (ValueError, TypeError, AttributeError, CorruptFileError) as error:
         raise CorruptFileError(

@@ -17,7 +17,7 @@ def to_union(batch: SceneBatch, union: SceneType) -> SceneBatch:
 
     Args:
         batch: B scenes of a type whose assets ``union`` has.
-        union: of :func:`~scene_envs.scene_types.union_scene_type`, or any scene type with those assets.
+        union: Result of :func:`~scene_envs.scene_types.union_scene_type`, or any scene type with those assets.
 
     Raises:
         InvalidInputError: an asset that ``union`` lacks.

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 
 import torch
-from torch import Tensor
 
 from scene_envs.scene import SceneBatch
 
 MAX_PENETRATION = 1e-3
 """Deepest overlap (m) of any pair of objects in a kept scene."""
 MAX_DISPLACEMENT = 1e-2
-"""How far (m) any object of a kept scene may move while it settles."""
+"""Largest motion (m) of any object of a kept scene while it settles."""
 DURATION = 0.5
-"""How long (s) a scene settles."""
+"""Time (s) for which a scene settles."""
 KEPT = ""
 """The verdict on a scene that is kept."""
 
@@ -33,13 +31,6 @@ def judge_scenes(batch: SceneBatch) -> list[str]:
         for index, verdict in zip(candidates.tolist(), _physics(batch[candidates]), strict=True):
             verdicts[index] = verdict
     return verdicts
-
-
-def verify_scenes(batch: SceneBatch, reasons: Counter[str]) -> Tensor:
-    """(B,) bool: scenes to keep; why others are thrown away is counted in ``reasons``."""
-    verdicts = judge_scenes(batch)
-    reasons.update(verdict for verdict in verdicts if verdict != KEPT)
-    return torch.tensor([verdict == KEPT for verdict in verdicts], dtype=torch.bool)
 
 
 def _physics(batch: SceneBatch) -> list[str]:

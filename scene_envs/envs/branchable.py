@@ -1,4 +1,4 @@
-"""Check of the promises that planners rely on: states can be stored, sent elsewhere and expanded in any order."""
+"""Check of the contract of planners: states can be stored, sent elsewhere and expanded in any order."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ROUNDING = 1e-3
 
 
 class NotBranchableError(SceneEnvsError):
-    """A search environment breaks a promise that planners rely on."""
+    """A search environment breaks the contract that planners rely on."""
 
 
 def check_branchable(env: Any, *, seed: int = 0, children: int = 3) -> None:
@@ -31,13 +31,13 @@ def check_branchable(env: Any, *, seed: int = 0, children: int = 3) -> None:
     Expansion changes neither the current state of ``env`` nor the state that is expanded.
 
     Args:
-        env: has ``reset``, ``clone_state``, ``restore_state``, ``legal_actions``, ``expand``, ``expand_batch`` and
-            ``evaluate``, as ``SceneEnvs/Search-v0`` (wrappers are taken off).
-        seed: of the reset.
-        children: number of siblings that are made; two of them are expanded again.
+        env: Environment with ``reset``, ``clone_state``, ``restore_state``, ``legal_actions``, ``expand``,
+            ``expand_batch`` and ``evaluate``, such as ``SceneEnvs/Search-v0`` (wrappers are removed).
+        seed: Seed of the reset.
+        children: Number of siblings that are made; two of them are expanded again.
 
     Raises:
-        NotBranchableError: a promise is broken; the message says which.
+        NotBranchableError: a rule of the contract is broken; the message names it.
 
     >>> from scene_envs.envs import SearchEnv
     >>> check_branchable(SearchEnv(objective="object_count", num_steps=2, slots=6))

@@ -1,4 +1,4 @@
-"""The Gymnasium adapter of the denoising MDP: one environment, one scene."""
+"""Gymnasium adapter of the denoising MDP: one environment, one scene."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
     In `noise` mode an action drawn from N(0, I) reproduces the prior, so standard agents start from the prior's own
     behaviour. The last step has std 0, so its action has no effect. Actions beyond the bound are clipped. A wrong
     shape, NaN or infinity raises `InvalidInputError`. Entries that the prior knows (welded objects with one constant
-    pose, features that never vary) keep their values, whatever the action is.
+    pose, features that never vary) keep their values under every action.
 
     ## Observation Space
 

@@ -1,4 +1,4 @@
-"""The batched Gymnasium adapter of the denoising MDP: a vector environment with every autoreset mode."""
+"""Batched Gymnasium adapter of the denoising MDP: a vector environment with every autoreset mode."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class DenoisingVectorEnv(SpecMixin, VectorEnv[Observation, np.ndarray, np.ndarra
     """B denoising environments as one batch; :class:`DenoisingEnv` describes the environment.
 
     Args:
-        num_envs: B.
+        num_envs: B, the number of environments.
         render_mode: None or ``"rgb_array"``.
         autoreset_mode: ``"SameStep"``, ``"NextStep"`` or ``"Disabled"``, or the Gymnasium enum.
-        **settings: fields of :class:`~scene_envs.envs.settings.DenoisingSettings`.
+        **settings: Fields of :class:`~scene_envs.envs.settings.DenoisingSettings`.
 
     ``info`` values are (B,) arrays, each with its ``_key`` mask. In ``SameStep`` mode the step that ends an
     episode also gives ``final_obs`` ((B,) objects, each the dict of one environment) and ``final_info``.
@@ -77,7 +77,7 @@ class DenoisingVectorEnv(SpecMixin, VectorEnv[Observation, np.ndarray, np.ndarra
         """Start new episodes.
 
         Args:
-            seed: environment i gets ``seed + i``, or ``seed[i]`` from a list; None continues the generators.
+            seed: Seed of environment i is ``seed + i``, or ``seed[i]`` of a list; None continues the generators.
             options: ``{"reset_mask": (B,) bool}`` restarts only some environments.
         """
         mask = check_reset_mask(options, self.num_envs)
@@ -95,7 +95,7 @@ class DenoisingVectorEnv(SpecMixin, VectorEnv[Observation, np.ndarray, np.ndarra
 
         Raises:
             InvalidInputError: wrong shape, or a value that is not finite.
-            ResetNeededError: in ``Disabled`` mode, an episode that ended was not reset.
+            ResetNeededError: an episode that ended was not reset (``Disabled`` mode).
         """
         result = self.core.step(actions, ~self._pending)
         if self._pending.any():

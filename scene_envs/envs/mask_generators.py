@@ -1,4 +1,4 @@
-"""Shipped mask generators: masks by the objective's blame, by physics, by prompt and by place."""
+"""Built-in mask generators: masks by the objective's blame, by physics, by prompt and by place."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_PENETRATION = 1e-3
 
 
 def bad_objects(scene: SceneBatch, score: Score) -> Tensor | None:
-    """(N,) bool: free objects that the objective blames, or None when it says nothing about single objects.
+    """(N,) bool: free objects that the objective blames, or None when it does not judge single objects.
 
     An object is blamed when the objective's flag ``feasible`` is False for it or, lacking that flag, when its
     credit per object is not positive.
@@ -33,10 +33,10 @@ def bad_objects(scene: SceneBatch, score: Score) -> Tensor | None:
 
 
 def infeasible_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-    """The free objects that physics calls infeasible, whatever the objective; none when all are feasible.
+    """The free objects that physics calls infeasible, under any objective; none when all are feasible.
 
     The verdict is the objective's flag ``feasible`` where the objective has one. Otherwise it is the flag of the reward
-    ``feasible_objects``, which simulates no scene twice.
+    ``feasible_objects``, which keeps its verdicts, so that no scene is simulated twice.
     """
     flags = score.object_flags.get("feasible")
     if flags is None:
@@ -64,8 +64,8 @@ def infeasible_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Gen
 def blamed_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
     """The free objects that the objective blames, and all empty slots.
 
-    With an objective that counts feasible objects this is :func:`infeasible_or_empty_mask`. Where the objective says
-    nothing about single objects, or blames none of a full scene, it is :func:`random_mask`.
+    With an objective that counts feasible objects this is :func:`infeasible_or_empty_mask`. Where the objective does
+    not judge single objects, or blames none of a full scene, it is :func:`random_mask`.
     """
     bad = bad_objects(scene, score)
     if bad is None or not bool((bad | scene.is_empty[0]).any()):
@@ -83,18 +83,14 @@ def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Te
 
 
 def check_count(mask: str, key: str, value: Any) -> None:
-    """Refuse a number of slots that is no whole number from 0 on; None stands for all."""
+    """Refuse a number of slots that is neither None (all) nor a whole number of at least 0."""
     if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 0):
-        raise InvalidInputError(f"mask={mask}: {key}={value!r} must be a whole number from 0 on")
+        raise InvalidInputError(f"mask={mask}: {key}={value!r} must be a whole number of at least 0")
 
 
 @dataclass(frozen=True)
 class EmptyMask:
-    """Empty slots, and no object.
-
-    Args:
-        count: how many, at random; None for all.
-    """
+    """Empty slots, and no object: ``count`` of them at random, or all with None."""
 
     count: int | None = None
 
@@ -108,10 +104,7 @@ class EmptyMask:
 
 @dataclass(frozen=True)
 class LowestScoringMask:
-    """The free objects of the lowest credit, ties at random.
-
-    Args:
-        count: k, how many.
+    """The ``count`` free objects of the lowest credit, ties at random.
 
     Raises:
         InvalidInputError: the objective gives no credit per object.
@@ -140,9 +133,9 @@ class RegionMask:
     """The free objects whose frames are in a box of the workspace, and some empty slots.
 
     Args:
-        low: smallest x, y, z, m.
-        high: largest x, y, z, m.
-        empty: empty slots that join, at random.
+        low: Smallest x, y, z, m.
+        high: Largest x, y, z, m.
+        empty: Number of empty slots that are added at random.
     """
 
     low: Sequence[float] = (-np.inf, -np.inf, -np.inf)
@@ -163,11 +156,7 @@ class RegionMask:
 
 @dataclass(frozen=True)
 class ExplicitMask:
-    """Slots that the user lists.
-
-    Args:
-        slots: their indices.
-    """
+    """Slots that the user lists by their indices."""
 
     slots: Sequence[int] = ()
 
@@ -186,10 +175,7 @@ class OffPromptMask:
     """Objects that contradict a prompt, and empty slots for objects that are missing.
 
     These are the objects beyond the numbers in the prompt, both objects of a relation that does not hold, and one empty
-    slot for each missing object.
-
-    Args:
-        prompt: the text; None takes the prompt of the search.
+    slot for each missing object. Without a ``prompt`` of its own, the mask takes the prompt of the search.
     """
 
     prompt: str | None = None
@@ -199,7 +185,7 @@ class OffPromptMask:
         return self if self.prompt is not None else OffPromptMask(prompt)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated; none when the scene is as the prompt says.
+        """(N,) bool, True where a slot is regenerated; none when the scene follows the prompt.
 
         Raises:
             InvalidInputError: there is no prompt, or it cannot be read.
@@ -228,20 +214,17 @@ class OffPromptMask:
 
 @dataclass(frozen=True)
 class CulpritsMask:
-    """The fewest objects whose replacement ends all overlaps, and a few empty slots.
+    """A smallest set of objects whose replacement ends all overlaps, and a few empty slots.
 
     An objective that counts feasible objects blames both objects of an overlapping pair, but it is enough to replace
     one of them. Objects with most overlaps are masked first, until no two unmasked objects overlap. Blamed objects that
     overlap nothing (they fall or slide) are masked too. If these are fewer than ``at_least`` slots, random empty slots
-    are added, so that good scenes can grow. With an objective that says nothing about single objects, ``at_least``
+    are added, so that good scenes can grow. With an objective that does not judge single objects, ``at_least``
     random slots are masked.
 
     The number of masked slots should be small. At high noise the observed objects are noisy as well, so the masked
-    slots get their usual share of objects, whatever is already there. If all empty slots are masked, inpainting by
-    clamping therefore adds too many objects and spoils the observed ones.
-
-    Args:
-        at_least: smallest number of slots to regenerate, if the scene has as many.
+    slots get their usual share of objects, regardless of the observed ones. If all empty slots are masked, inpainting
+    by clamping therefore adds too many objects and spoils the observed ones.
 
     A scene without free objects is regenerated whole.
     """
@@ -252,13 +235,7 @@ class CulpritsMask:
         check_count("culprits", "at_least", self.at_least)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated.
-
-        Args:
-            scene: a batch of one.
-            score: the objective's verdict on it.
-            rng: breaks ties and draws slots.
-        """
+        """(N,) bool, True where a slot is regenerated; ``rng`` breaks ties and draws slots."""
         free, empty = scene.is_free[0], scene.is_empty[0]
         if not bool(free.any()):
             return empty.clone()
@@ -277,10 +254,8 @@ class BalancedMask:
     """The culprits of :class:`CulpritsMask`, and random slots until the shares of objects and of empty slots are equal.
 
     Such a mask does not depend on the content of slots, like the masks of training, so the number of objects stays the
-    same. A mask of all empty slots depends on the content, and the prior then adds too many objects.
-
-    Args:
-        at_least: smallest number of slots to regenerate, if the scene has as many; the share grows until it is reached.
+    same. A mask of all empty slots depends on the content, and the prior then adds too many objects. The share grows
+    until ``at_least`` slots are masked, if the scene has as many.
     """
 
     at_least: int = 4
@@ -289,7 +264,7 @@ class BalancedMask:
         check_count("balanced", "at_least", self.at_least)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated; arguments as for :class:`CulpritsMask`."""
+        """(N,) bool, True where a slot is regenerated."""
         free, empty = scene.is_free[0], scene.is_empty[0]
         mask = CulpritsMask(at_least=0)(scene, score, rng)
         slots, objects = int((free | empty).sum()), int(free.sum())
@@ -300,7 +275,7 @@ class BalancedMask:
 
 
 def _culprits(scene: SceneBatch, bad: Tensor, rng: np.random.Generator) -> list[int]:
-    """Slots of blamed objects (``bad``, (N,) bool), less those that are fine once others are gone."""
+    """Slots of blamed objects (``bad``, (N,) bool), without those that are feasible once others are removed."""
     blamed = torch.nonzero(bad).flatten().tolist()
     if not blamed:
         return []
@@ -330,7 +305,7 @@ def cover(pairs: Sequence[tuple[int, int]], fixed: Collection[int], rng: np.rand
 
 def _overlaps(scene: SceneBatch) -> list[tuple[int, int]]:
     """Pairs of slots that overlap deeper than feasibility allows."""
-    from scene_envs.physics import penetration  # with the physics libraries, which other masks spare
+    from scene_envs.physics import penetration  # loads the physics libraries, which other masks do not need
 
     return [pair.slots for pair in penetration(scene).pairs[0] if pair.depth > MAX_PENETRATION]
 

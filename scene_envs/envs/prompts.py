@@ -18,23 +18,23 @@ from scene_envs.scene_types import SceneType
 
 _BANK = 64
 """Scenes of a grammar that prompts are drawn from, with three prompts each."""
-_MOST_ROWS = 4096
-"""Number of prompts whose tokens are remembered; beyond it, all of them are forgotten."""
+_MAX_ROWS = 4096
+"""Largest number of prompts whose tokens are kept; beyond it, all of them are dropped."""
 
 
 class EnvPrompts:
     """The prompts of an environment's episodes.
 
     Args:
-        prior: the prior of the environment.
+        prior: Prior of the environment.
         prompt: None for no prompts; one prompt; a list to draw from; or ``"grammar"`` (or ``"data"``, which is the
             same here) for descriptions of the grammar's scenes.
-        guidance: w of classifier-free guidance in the prior's own steps.
-        slots: slots per scene; a prompt that asks for more objects is refused.
+        guidance: Weight w of classifier-free guidance in the prior's own steps.
+        slots: Number of slots per scene; a prompt that asks for more objects is refused.
 
     Attributes:
-        guidance: as given.
-        given: whether episodes have prompts.
+        guidance: Weight of classifier-free guidance.
+        given: Whether episodes have prompts.
 
     Raises:
         InvalidInputError: a prompt for a prior that reads none, guidance without a prompt, or a prompt that cannot be
@@ -51,7 +51,7 @@ class EnvPrompts:
         self.guidance = float(guidance)
         self._choices: tuple[str, ...] | None = _choices(prompt)
         self.given = prompt is not None
-        self._rows: dict[str, Tensor] = {}  # token indices by prompt: each is read, and warned about, once
+        self._rows: dict[str, Tensor] = {}  # token indices by prompt; each is read once
         if not math.isfinite(self.guidance):
             raise InvalidInputError(f"guidance={guidance!r} must be a finite number")
         if self.guidance and (not self.given or self._choices == ("",)):
@@ -65,7 +65,7 @@ class EnvPrompts:
                 "leave prompt= out, or give a prior that reads prompts"
             )
         if self._choices:
-            self.read(self._choices)  # raises now, not later, if a prompt cannot be followed
+            self.read(self._choices)  # raises if a prompt cannot be followed
 
     @property
     def reader(self) -> PromptedPriorLike | None:
@@ -94,7 +94,7 @@ class EnvPrompts:
             raise InvalidInputError(f"a prior of {self._prior.scene_type.name!r} without text reads no prompts")
         new = [prompt for prompt in dict.fromkeys(prompts) if prompt not in self._rows]
         if new:
-            if len(self._rows) > _MOST_ROWS:
+            if len(self._rows) > _MAX_ROWS:
                 self._rows.clear()
                 new = list(dict.fromkeys(prompts))
             self._rows |= dict(zip(new, self.reader.read_prompts(new, self._slots), strict=True))
@@ -116,7 +116,7 @@ def _choices(prompt: Any) -> tuple[str, ...] | None:
 
 @lru_cache(maxsize=16)
 def grammar_prompts(scene_type: SceneType, slots: int) -> tuple[str, ...]:
-    """Descriptions of scenes of the type's grammar, of all kinds; always the same ones.
+    """Descriptions of all kinds of scenes of the type's grammar; the same at every call.
 
     Raises:
         InvalidInputError: the grammar makes no scene of so few slots.

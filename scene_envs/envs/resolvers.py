@@ -1,4 +1,4 @@
-"""Resolvers of reward and prior names, through entry points, when an environment is built."""
+"""Resolvers of reward and prior names through entry points."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from scene_envs.plugins import plugin_entry_points
 from scene_envs.protocols import PriorLike, SceneScorer
 
 ENTRY_POINT_GROUP = "scene_envs.resolvers"
-"""Entry points of this group. ``reward = "module:function"`` names a function that takes what :func:`resolve_reward`
-takes, and returns a :class:`~scene_envs.protocols.SceneScorer`. ``prior = "module:function"`` names a function that
-takes a name or path, and returns a :class:`~scene_envs.protocols.PriorLike`."""
+"""Entry points of this group. ``reward = "module:function"`` names a function with the argument of
+:func:`resolve_reward` that returns a :class:`~scene_envs.protocols.SceneScorer`. ``prior = "module:function"`` names a
+function of a name or path that returns a :class:`~scene_envs.protocols.PriorLike`."""
 
 
 def resolve_reward(reward: Any) -> SceneScorer:
@@ -26,7 +26,7 @@ def resolve_reward(reward: Any) -> SceneScorer:
 
 
 def resolve_prior(prior: Any) -> PriorLike:
-    """A prior from a name or a path; anything else comes back as it is.
+    """A prior from a name or a path; any other value is returned unchanged.
 
     Raises:
         UnknownNameError: no shipped prior has that name; the nearest known one is offered.

@@ -21,9 +21,9 @@ class Score:
     Attributes:
         value: (B,) float32; 0 where ``valid`` is False.
         valid: (B,) bool.
-        terms: named (B,) float32; 0 where not finite.
+        terms: Values (B,) float32 by name of the term; 0 where not finite.
         per_object: (B, N) float credit per slot, or None.
-        object_flags: named (B, N) bool.
+        object_flags: Flags (B, N) bool by name.
     """
 
     value: Tensor
@@ -51,12 +51,12 @@ class Score:
 
 
 class RewardScorer:
-    """Resolves a reward once and scores batches of scenes with it, on the CPU.
+    """Scorer of batches of scenes on the CPU, with a reward that is resolved once.
 
     Args:
-        reward: a registered name, a mapping with its settings, a function or a reward object.
-        workers: physics worker processes; 0 computes in this process, ``"ray"`` on a Ray cluster. Started at the first
-            scoring.
+        reward: Registered name, mapping with its settings, function or reward object.
+        workers: Number of physics worker processes, started at the first scoring; 0 computes in this process, ``"ray"``
+            on a Ray cluster.
 
     >>> scorer = RewardScorer("object_count")
     >>> scorer(SceneBatch.empty("dimsum_table", 2)).valid.tolist()

@@ -1,4 +1,4 @@
-"""Search MDP: states, and pure functions that make roots, children and values. No episode, no Gymnasium."""
+"""Search MDP: states, and pure functions that make roots, children and values."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class SearchState:
 
     Attributes:
         scene: (N, D) float32 raw scene; never write into it.
-        mask: (N,) bool, the slots that the next action regenerates.
-        depth: actions taken since the root.
-        path: those actions.
-        seed: of the root; with ``path`` it fixes all random numbers of this state and of those below it.
+        mask: (N,) bool, slots that the next action regenerates.
+        depth: Number of actions since the root.
+        path: Actions since the root.
+        seed: Seed of the root; with ``path`` it fixes all random numbers of this state and of those below it.
         value: Φ in [0, 1]; the parent's where ``valid`` is False.
-        objective: the objective's raw value; 0 where not valid.
-        valid: whether the objective could score this scene.
-        trace: tensors from the object that steered the denoising, such as an intermediate scene; usually None.
+        objective: Raw value of the objective; 0 where not valid.
+        valid: Whether the objective could score this scene.
+        trace: Tensors from the object that steered the denoising, such as an intermediate scene; usually None.
 
     Two states are equal when they are the same node: same seed, path, scene and mask.
     """
@@ -80,15 +80,10 @@ class SearchState:
 
 @dataclass(frozen=True)
 class NodeRandomness:
-    """The two independent sources of random numbers of one node of the tree.
+    """The two independent sources of random numbers of one node of the tree."""
 
-    Attributes:
-        noise: torch generator for the diffusion that makes the node's scene.
-        mask: NumPy generator for its mask.
-    """
-
-    noise: torch.Generator
-    mask: np.random.Generator
+    noise: torch.Generator  # torch generator for the diffusion that makes the node's scene
+    mask: np.random.Generator  # NumPy generator for the node's mask
 
     @classmethod
     def at(cls, seed: int, path: tuple[int, ...]) -> NodeRandomness:
@@ -106,19 +101,19 @@ class NodeRandomness:
 
 
 class SearchProblem:
-    """Generates the tree of partial scenes (Pfaff et al. 2025, inference-time search by inpainting).
+    """Generator of the tree of partial scenes (Pfaff et al. 2025, inference-time search by inpainting).
 
     Every function of a state is deterministic. Noise and masks come from the state's own seed and path, so a
     subtree does not depend on the order of expansion. Expanding in different batches may change the network's
     rounding by about 1e-6, never the random numbers.
 
     Args:
-        **settings: fields of :class:`~scene_envs.envs.settings.SearchSettings`.
+        **settings: Fields of :class:`~scene_envs.envs.settings.SearchSettings`.
 
     Attributes:
-        evaluations: denoiser evaluations (NFE) spent so far, ``num_steps`` per generated scene and twice that many with
-            guidance.
-        num_actions: actions of a state, legal or not.
+        evaluations: Number of denoiser evaluations (NFE) so far, ``num_steps`` per generated scene and twice that many
+            with guidance.
+        num_actions: Number of actions of a state, legal or not.
 
     >>> problem = SearchProblem(objective="object_count", num_steps=2, max_depth=1)
     >>> root = problem.root(seed=0)
@@ -145,7 +140,7 @@ class SearchProblem:
         self.claim_guidance, self.physics_guidance = chosen.claim_guidance, chosen.physics_guidance
         check_physics_guidance(self.physics_guidance, self.scene_type)
         self._may_be_guided = "physics_guidance" in inspect.signature(self.prior.inpaint).parameters
-        self.prior.step_table(self.num_steps)  # raises now, not later, if the prior has fewer steps
+        self.prior.step_table(self.num_steps)  # raises if the prior has fewer steps
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
         self.scorer = RewardScorer(chosen.objective, chosen.workers)
@@ -158,12 +153,10 @@ class SearchProblem:
         declared = self.scorer.maximum(self.slots, free_slots) if chosen.objective_scale is None else None
         self.scale = chosen.objective_scale or declared or float(free_slots)
         self.evaluations = 0
-        self._told_of_scale = self._told_of_zero = False
+        self._warned_of_scale = self._warned_of_zero = False
 
     def _resolve_mask(self, mask: Any) -> MaskGenerator:
         return mask_for_prompt(resolve_mask(mask), self.prompt)
-
-    # -- states ---------------------------------------------------------------------------------
 
     def root(self, seed: int, scene: SceneBatch | None = None) -> SearchState:
         """The root of ``seed``: ``scene`` (a batch of one), or a sample of the prior."""
@@ -222,12 +215,12 @@ class SearchProblem:
         return state.value >= 1.0 or not bool(state.mask.any())
 
     def without_masked(self, state: SearchState) -> SearchState:
-        """The same node without the objects that are still masked; a search may return it in the end."""
+        """The same node without the objects that are still masked."""
         empty = SceneBatch.empty(self.scene_type, 1, self.slots).tensor[0]
         return self.with_scene(state, torch.where(state.mask[:, None], empty, state.scene))
 
     def with_scene(self, state: SearchState, scene: Tensor) -> SearchState:
-        """The node of ``state`` with another ``scene`` (N, D), scored and masked anew; nothing is denoised."""
+        """The node of ``state`` with another ``scene`` (N, D), scored and masked again; nothing is denoised."""
         batch = SceneBatch(scene.unsqueeze(0), self.scene_type)
         return self._score(batch, [(state.seed, state.path, state.value)])[0]
 
@@ -244,8 +237,6 @@ class SearchProblem:
             )
         if self.is_solved(state):
             raise InvalidInputError(f"nothing is left to improve in the state at path {state.path}: it has no children")
-
-    # -- generation and scoring -----------------------------------------------------------------
 
     def _changeable(self) -> Tensor:
         """(N,) bool: slots that may be regenerated, all but those of fixed welded objects."""
@@ -273,7 +264,7 @@ class SearchProblem:
         if self.physics_guidance:
             _check_takes(self.prior, "physics_guidance", "leave physics_guidance=0")
         if self.physics_guidance or self._may_be_guided:
-            how["physics_guidance"] = self.physics_guidance  # 0 as well: some priors are guided where none is given
+            how["physics_guidance"] = self.physics_guidance  # also 0, because some priors are guided by default
         if reader is None or self.prompt is None:
             return self.prior.inpaint(batch, masks, **how).to("cpu")
         if self.claim_guidance:
@@ -295,18 +286,18 @@ class SearchProblem:
         self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...], parent_value: float
     ) -> SearchState:
         valid, objective = bool(score.valid[0]), float(score.value[0])
-        if objective > self.scale and not self._told_of_scale:
-            self._told_of_scale = True
+        if objective > self.scale and not self._warned_of_scale:
+            self._warned_of_scale = True
             _LOGGER.warning(
-                "the objective is %.4g, more than objective_scale=%.4g: its value in the search ends at 1; raise "
+                "the objective is %.4g, more than objective_scale=%.4g: its value in the search is clipped to 1; raise "
                 "objective_scale to search further",
                 objective,
                 self.scale,
             )
-        if valid and objective < 0 and not self._told_of_zero:
-            self._told_of_zero = True
+        if valid and objective < 0 and not self._warned_of_zero:
+            self._warned_of_zero = True
             _LOGGER.warning(
-                "the objective is %.4g: below 0 the search tells no scenes apart; shift it, as with "
+                "the objective is %.4g: below 0 the search cannot compare scenes; shift it, as with "
                 "{name: weighted_sum, rewards: [...], offset: minus the value that becomes 0}",
                 objective,
             )
@@ -322,7 +313,7 @@ class SearchProblem:
         )
 
     def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Any]:
-        """The fields of the state that say what is regenerated."""
+        """The mask fields of the state."""
         return {"mask": self._mask(self.mask_generator, scene, score, seed, path)}
 
     def _mask(

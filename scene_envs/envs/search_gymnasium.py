@@ -123,13 +123,12 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         self.render_mode = render_mode
         self._rendering = SearchRendering(render_mode)
         self.problem = problem
-        slot_count = problem.slots
         self.observation_space = spaces.Dict(
             {
-                "scene": scene_box(STATE_BOUND, slot_count, self.problem.scene_type.features),
-                "object_mask": spaces.MultiBinary(slot_count),
+                "scene": scene_box(STATE_BOUND, problem.slots, problem.scene_type.features),
+                "object_mask": spaces.MultiBinary(problem.slots),
                 "regenerate": regenerate,
-                "depth": spaces.Box(0, self.problem.max_depth, (1,), np.int64),
+                "depth": spaces.Box(0, problem.max_depth, (1,), np.int64),
                 "value": spaces.Box(0.0, 1.0, (1,), np.float32),
             }
         )
@@ -144,15 +143,13 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         self._best: SearchState | None = None
         self._nfe_at_reset = 0
 
-    # -- the Gymnasium interface ----------------------------------------------------------------
-
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start from a sample of the prior.
 
         Args:
-            seed: of ``self.np_random``, which draws the seed of the tree.
+            seed: Seed of ``self.np_random``, which draws the seed of the tree.
             options: ``{"state": SearchState}`` or ``{"scene": SceneBatch of 1}`` to start from.
         """
         super().reset(seed=seed)
@@ -177,7 +174,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         """
         parent = self.state
         if why := self._end(parent):
-            if not self._begun:  # nothing to do from the start: the first step ends the episode where it began
+            if not self._begun:  # nothing to improve at the reset: the first step ends the episode
                 self._begun = True
                 observation, info = self._observe(parent)
                 solved = self.problem.is_solved(parent)
@@ -195,7 +192,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         return self.expand(state, action)
 
     def _end(self, state: SearchState) -> str:
-        """Why the episode ends at ``state``; empty where it goes on."""
+        """Reason why the episode ends at ``state``; empty where it goes on."""
         if self.problem.is_solved(state):
             return "with nothing left to improve"
         if state.depth >= self.problem.max_depth:
@@ -210,11 +207,9 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         return self._rendering.picture(self.scene(), self.state)
 
     def close(self) -> None:
-        """Stop physics workers, if any, and let the viewer's page stay as it is."""
+        """Stop physics workers, if any, and close the viewer; its page remains."""
         self.problem.close()
         self._rendering.close()
-
-    # -- the planner's interface ----------------------------------------------------------------
 
     @property
     def state(self) -> SearchState:
@@ -224,7 +219,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         return self._state
 
     def clone_state(self) -> SearchState:
-        """The current state; it is immutable, so this is no copy."""
+        """The current state, which is immutable and therefore not copied."""
         return self.state
 
     def restore_state(self, state: SearchState) -> None:
@@ -270,7 +265,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         return self.problem.without_masked(state)
 
     def with_scene(self, state: SearchState, scene: Tensor) -> SearchState:
-        """``state`` with another ``scene`` (N, D), scored and masked anew; nothing is denoised."""
+        """``state`` with another ``scene`` (N, D), scored and masked again; nothing is denoised."""
         return self.problem.with_scene(state, scene)
 
     def scene(self, state: SearchState | None = None) -> SceneBatch:
@@ -282,8 +277,6 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     def nfe(self) -> int:
         """Denoiser evaluations since the reset."""
         return self.problem.evaluations - self._nfe_at_reset
-
-    # -- helpers --------------------------------------------------------------------------------
 
     def _check_state(self, state: Any) -> SearchState:
         kind = self.problem.state_type

@@ -1,4 +1,4 @@
-"""Search MDP with a choice of masks: an action is one of K masks and one of B inpaintings of its slots."""
+"""Search MDP with a choice of masks: an action chooses one of K masks and one of B inpaintings of its slots."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class MaskChoiceState(SearchState):
     """A partial scene with K masks to choose from; ``mask`` is the union of them.
 
     Attributes:
-        masks: (K, N) bool, the slots that each mask regenerates.
+        masks: (K, N) bool, slots that each mask regenerates.
     """
 
     masks: Tensor = field(kw_only=True)
@@ -41,10 +41,10 @@ class MaskChoiceProblem(SearchProblem):
     the tree equals that of a :class:`~scene_envs.envs.search.SearchProblem` with this mask, bit for bit.
 
     Args:
-        **settings: fields of :class:`~scene_envs.envs.settings.SearchMaskSettings`.
+        **settings: Fields of :class:`~scene_envs.envs.settings.SearchMaskSettings`.
 
     Attributes:
-        mask_names: of the K masks, in the order of the actions.
+        mask_names: Names of the K masks, in the order of the actions.
 
     >>> problem = MaskChoiceProblem(objective="object_count", num_steps=2, masks=["empty", "random"], branching=2)
     >>> root = problem.root(seed=0)

@@ -35,7 +35,7 @@ class SearchMaskEnv(SearchEnv):
     `Discrete(K * branching)`: action `k * branching + j` is inpainting j of mask k. An action is legal if its mask has
     a slot. `action_masks()` marks the legal actions in the form that MaskablePPO expects. `legal_actions()` lists the
     first inpainting of every mask before the second of any, so a planner that expands a few actions tries all masks.
-    `step` with an illegal action leaves the scene as it is; it counts as a step of `max_depth` and costs no denoiser
+    `step` with an illegal action leaves the scene unchanged; it counts as a step of `max_depth` and costs no denoiser
     evaluations. `expand` refuses an illegal action.
 
     ## Observation Space

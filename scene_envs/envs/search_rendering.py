@@ -18,8 +18,8 @@ class SearchRendering:
     """Rendering of the search environments.
 
     Args:
-        mode: ``"rgb_array"`` for pictures in which the objects that are to be regenerated are red; ``"human"`` for a
-            page in the browser that gets each state as another scene; None for nothing.
+        mode: ``"rgb_array"`` for pictures with masked objects in red; ``"human"`` for a page in the browser that shows
+            each state as another scene; None for no rendering.
     """
 
     MODES = ("human", "rgb_array")
@@ -48,7 +48,7 @@ class SearchRendering:
         self._viewer.show(scene, f"{value}, {masked} objects and {empty} empty slots masked")
 
     def close(self) -> None:
-        """Let the page stay as it is."""
+        """Close the viewer; its page remains."""
         if self._viewer is not None:
             self._viewer.close()
             self._viewer = None

@@ -14,10 +14,10 @@ from scene_envs.scene_types import SceneType
 
 ACTION_MODES = ("next_sample", "noise")
 PROMPT_SOURCES = ("data", "grammar")
-"""Values of ``prompt`` that stand for descriptions of scenes; any other text is a prompt itself."""
+"""Values of ``prompt`` that select descriptions of scenes; any other text is a prompt itself."""
 
-_MOST_SLOTS = 100_000
-_LARGEST = 1e30
+_MAX_SLOTS = 100_000
+_MAX_NUMBER = 1e30
 
 Init = TypeVar("Init", bound=Callable[..., None])
 
@@ -27,16 +27,16 @@ class EnvSettings:
     """Settings of every environment.
 
     Attributes:
-        scene: scene type or its name; None means that of the prior, and ``dimsum_table`` without one.
-        prior: name, path or prior; None means the shipped prior of the scene type.
-        num_steps: denoising steps: of an episode of denoising, of each scene of a search.
-        slots: N, slots per scene; None means the scene type's.
-        workers: physics worker processes; 0 computes in this process, ``"ray"`` on a Ray cluster.
-        prompt: what scenes should hold, for priors that read prompts; None for none.
-        guidance: weight of classifier-free guidance in the prior's own steps; needs a prompt.
+        scene: Scene type or its name; None means that of the prior, and ``dimsum_table`` without one.
+        prior: Name, path or prior; None means the shipped prior of the scene type.
+        num_steps: Number of denoising steps of an episode of denoising, or of each scene of a search.
+        slots: N, the number of slots per scene; None means the scene type's.
+        workers: Number of physics worker processes; 0 computes in this process, ``"ray"`` on a Ray cluster.
+        prompt: Description of the wanted scenes, for priors that read prompts; None for none.
+        guidance: Weight of classifier-free guidance in the prior's own steps; needs a prompt.
 
     Raises:
-        InvalidInputError: a number is outside what is accepted.
+        InvalidInputError: a number is outside its range.
     """
 
     scene: str | SceneType | None = None
@@ -48,20 +48,19 @@ class EnvSettings:
     guidance: float = 0.0
 
     def __post_init__(self) -> None:
-        self._check_at_least_one("num_steps")
+        self._require_at_least_one("num_steps")
         if self.slots is not None:
-            self._check_at_least_one("slots", _MOST_SLOTS)
+            self._require_at_least_one("slots", _MAX_SLOTS)
         if not _is_finite(self.guidance):
             raise InvalidInputError(f"guidance={_shown(self.guidance)} must be a finite number; 0 for none")
 
-    def _check_at_least_one(self, name: str, most: int = 2**31 - 1) -> None:
+    def _require_at_least_one(self, name: str, maximum: int = 2**31 - 1) -> None:
         number = getattr(self, name)
-        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= most:
-            beyond = isinstance(number, int) and number > most
-            at_most = f" and at most {most:,}" if beyond else ""
+        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= maximum:
+            at_most = f" and at most {maximum:,}" if isinstance(number, int) and number > maximum else ""
             raise InvalidInputError(f"{name}={_shown(number)} must be a whole number of at least 1{at_most}")
 
-    def _check_positive(self, name: str) -> None:
+    def _require_positive(self, name: str) -> None:
         if not _is_finite(number := getattr(self, name)) or number <= 0:
             raise InvalidInputError(f"{name}={_shown(number)} must be positive and finite")
 
@@ -71,12 +70,12 @@ class DenoisingSettings(EnvSettings):
     """Settings of the denoising environments.
 
     Attributes:
-        reward: name, mapping, function or reward object.
+        reward: Name, mapping, function or reward object.
         action_mode: ``"next_sample"`` or ``"noise"``.
-        max_action: actions are clipped to ±max_action.
+        max_action: Bound to which the entries of actions are clipped.
 
     Raises:
-        InvalidInputError, UnknownNameError: a value is outside what is accepted.
+        InvalidInputError, UnknownNameError: a value is outside its range.
     """
 
     reward: Any = "object_count"
@@ -86,7 +85,7 @@ class DenoisingSettings(EnvSettings):
     def __post_init__(self) -> None:
         if self.action_mode not in ACTION_MODES:
             raise unknown_name("action mode", str(self.action_mode), ACTION_MODES)
-        self._check_positive("max_action")
+        self._require_positive("max_action")
         super().__post_init__()
         if self.guidance and self.action_mode != "noise":
             raise InvalidInputError(
@@ -100,17 +99,17 @@ class TreeSettings(EnvSettings):
     """Settings of both search environments.
 
     Attributes:
-        objective: any reward: name, mapping, function or reward object.
-        branching: B, inpaintings to choose from.
-        max_depth: actions per episode.
-        objective_scale: objective at which Φ is 1; None means the largest value that it declares, or else the number
+        objective: Any reward: name, mapping, function or reward object.
+        branching: B, the number of inpaintings to choose from.
+        max_depth: Largest number of actions per episode.
+        objective_scale: Objective at which Φ is 1; None means the largest value that it declares, or else the number
             of free slots.
-        max_nfe: denoiser evaluations per episode; None for any number.
-        claim_guidance: strength of guidance to the numbers and places that the prompt gives; needs a prompt.
-        physics_guidance: strength with which objects are moved out of overlaps and onto supports, 0 to 1.
+        max_nfe: Largest number of denoiser evaluations per episode; None for any number.
+        claim_guidance: Strength of guidance to the numbers and places that the prompt gives; needs a prompt.
+        physics_guidance: Strength with which objects are moved out of overlaps and onto supports, 0 to 1.
 
     Raises:
-        InvalidInputError: a value is outside what is accepted.
+        InvalidInputError: a value is outside its range.
     """
 
     objective: Any = "feasible_objects"
@@ -122,15 +121,15 @@ class TreeSettings(EnvSettings):
     physics_guidance: float = 0.0
 
     def __post_init__(self) -> None:
-        self._check_at_least_one("branching")
-        self._check_at_least_one("max_depth")
+        self._require_at_least_one("branching")
+        self._require_at_least_one("max_depth")
         if self.max_nfe is not None:
-            self._check_at_least_one("max_nfe")
+            self._require_at_least_one("max_nfe")
         super().__post_init__()
         check_claim_guidance(self.prompt, self.claim_guidance)
         check_physics_guidance(self.physics_guidance)
         if self.objective_scale is not None:
-            self._check_positive("objective_scale")
+            self._require_positive("objective_scale")
         if self.prompt is not None and not isinstance(self.prompt, str):
             raise InvalidInputError(f"prompt={self.prompt!r}: a search follows one text, or None")
 
@@ -140,7 +139,7 @@ class SearchSettings(TreeSettings):
     """Settings of the search environment with one mask.
 
     Attributes:
-        mask: name of a mask generator, a mapping with its settings, or a function; see :mod:`scene_envs.envs.masks`.
+        mask: Name of a mask generator, a mapping with its settings, or a function; see :mod:`scene_envs.envs.masks`.
     """
 
     mask: Any = "blamed_or_empty"
@@ -151,7 +150,7 @@ class SearchMaskSettings(TreeSettings):
     """Settings of the search environment with a choice of masks.
 
     Attributes:
-        masks: K of them, each as ``mask`` of :class:`SearchSettings`.
+        masks: The K masks, each like ``mask`` of :class:`SearchSettings`.
 
     Raises:
         InvalidInputError: no list, or an empty one.
@@ -166,14 +165,14 @@ class SearchMaskSettings(TreeSettings):
 
 
 def check_claim_guidance(prompt: Any, strength: Any) -> None:
-    """Refuse claim guidance that is not a number from 0 on, or has no prompt; ``""`` is no prompt.
+    """Refuse claim guidance that is no number of at least 0, or has no prompt; ``""`` is no prompt.
 
     Raises:
-        InvalidInputError: names the value and the remedy.
+        InvalidInputError: the message names the value and the remedy.
     """
     if not _is_finite(strength) or strength < 0:
         raise InvalidInputError(
-            f"claim_guidance={_shown(strength)} must be a finite number from 0 on; 0 guides nothing"
+            f"claim_guidance={_shown(strength)} must be a finite number of at least 0; 0 guides nothing"
         )
     if strength and not prompt:
         raise InvalidInputError(
@@ -186,7 +185,7 @@ def check_physics_guidance(strength: Any, scene_type: SceneType | None = None) -
     """Refuse physics guidance that is not a number from 0 to 1, or of scenes whose assets have no geometry.
 
     Raises:
-        InvalidInputError: names the value and the remedy.
+        InvalidInputError: the message names the value and the remedy.
     """
     if not _is_finite(strength) or not 0 <= strength <= 1:
         raise InvalidInputError(
@@ -205,12 +204,12 @@ def _is_finite(number: Any) -> bool:
     if isinstance(number, bool) or not isinstance(number, int | float | np.integer | np.floating):
         return False
     size: Any = abs(number)
-    return bool(size <= _LARGEST)
+    return bool(size <= _MAX_NUMBER)
 
 
 def _shown(value: Any) -> str:
     """A value in a message, of bounded length; Python refuses to write integers of thousands of digits."""
-    return "a very large number" if isinstance(value, int) and abs(value) > _LARGEST else repr(value)[:200]
+    return "a very large number" if isinstance(value, int) and abs(value) > _MAX_NUMBER else repr(value)[:200]
 
 
 def takes(settings: type[EnvSettings]) -> Callable[[Init], Init]:

@@ -63,7 +63,7 @@ def scene_box(bound: float, slots: int, features: int) -> spaces.Box:
 
 
 def prior_features(prior: PriorLike) -> int:
-    """D of the scenes that the prior denoises: the scene type's, unless the prior says otherwise."""
+    """D of the scenes that the prior denoises: the scene type's, unless the prior has its own."""
     return prior.features if isinstance(prior, EncodedPriorLike) else prior.scene_type.features
 
 
@@ -88,9 +88,9 @@ def check_action(action: Any, shape: tuple[int, ...], axes: tuple[str, ...]) -> 
     """``action`` as a finite tensor of ``shape`` and of torch's default dtype, float32 unless a program changes it.
 
     Args:
-        action: anything array-like.
-        shape: what is required.
-        axes: names of the dimensions, for the message.
+        action: Any array-like value.
+        shape: Required shape.
+        axes: Names of the dimensions, for the message.
 
     Raises:
         InvalidInputError: wrong shape, or a value that is not finite (the first one is named).

@@ -28,7 +28,7 @@ class SceneEnvSpec(EnvSpec):
 
 
 class SpecMixin:
-    """Environment whose ``spec`` is a :class:`SceneEnvSpec`, whatever Gymnasium sets."""
+    """Mixin of environments that turns the ``spec`` set by Gymnasium into a :class:`SceneEnvSpec`."""
 
     _spec: EnvSpec | None = None
 

@@ -1,4 +1,4 @@
-"""Export of scenes to simulators and viewers: URDF, SDF, Drake, MJCF, USD, GLB, arrays, and formats of your own."""
+"""Export of scenes to simulators and viewers: URDF, SDF, Drake, MJCF, USD, GLB, arrays, and users' own formats."""
 
 from typing import TYPE_CHECKING
 

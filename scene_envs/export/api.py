@@ -27,11 +27,11 @@ class ExportReport:
     """Files that an export wrote.
 
     Attributes:
-        output: the folder.
-        formats: the formats, in the order they were asked for.
-        scenes: per scene, the main file of each format.
-        assets: names of the assets in use.
-        size: bytes of everything in the export.
+        output: Folder of the export.
+        formats: Formats in the given order.
+        scenes: Main file of each format, for each scene.
+        assets: Names of the assets in use.
+        size: Size of the whole export, bytes.
     """
 
     output: Path
@@ -56,10 +56,10 @@ def export(
     scenes by a second call; an interrupted export goes on when the same call is made again.
 
     Args:
-        batch: B scenes. Nothing is moved here: make scenes simulation-ready first
+        batch: B scenes. Their poses are not changed: make scenes simulation-ready first
             (:func:`scene_envs.physics.make_ready`) if they must stand still.
-        output: folder; made if it does not exist. Other files in it are left alone.
-        formats: a name, several, or ``"all"`` that can be written here; see
+        output: Folder of the export; made if it does not exist. Other files in it are not touched.
+        formats: One or several names, or ``"all"`` for those that can be written here; see
             :func:`scene_envs.export.list_formats`.
         friction: Coulomb friction coefficient between any two surfaces; by default that of :mod:`scene_envs.physics`.
 
@@ -109,7 +109,7 @@ def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
             same = all(found[key] == fresh[key] for key in ("scene_type", "scenes", "friction", "digest"))
             found["formats"] = list(found["formats"])
         except (ValueError, KeyError, TypeError) as error:
-            raise CorruptFileError(f"{str(path)!r} is not what an export writes: {error}") from error
+            raise CorruptFileError(f"{str(path)!r} is no manifest of an export: {error}") from error
         if not same:
             raise InvalidInputError(
                 f"{str(root)!r} holds an export of other scenes ({found['scenes']} of {found['scene_type']!r}); "
@@ -130,7 +130,7 @@ def _write_manifest(root: Path, manifest: Mapping[str, Any]) -> None:
 
 
 def _digest(batch: SceneBatch) -> str:
-    """Digest of all that the files depend on: poses, and the geometry and mass of the assets."""
+    """Digest of the poses, and of the geometry and mass of the assets."""
     digest = hashlib.sha256(batch.tensor.cpu().contiguous().numpy().tobytes())
     scene_type: SceneType = batch.scene_type
     digest.update(repr((scene_type.assets, scene_type.welded)).encode())

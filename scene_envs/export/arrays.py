@@ -20,14 +20,14 @@ def scene_arrays(scene: PlacedScene) -> dict[str, Any]:
         int64, ``welded`` (n,) bool, ``names`` (n,) text, ``asset_names`` (C,) text in category order, and
         ``scene_type``, one text.
     """
-    things = scene.objects
+    objects = scene.objects
     return {
-        "translations": np.array([thing.translation for thing in things], dtype=np.float64).reshape(-1, 3),
-        "rotations": np.array([thing.rotation for thing in things], dtype=np.float64).reshape(-1, 3, 3),
-        "categories": np.array([thing.category for thing in things], dtype=np.int64),
-        "slots": np.array([thing.slot for thing in things], dtype=np.int64),
-        "welded": np.array([thing.welded for thing in things], dtype=bool),
-        "names": np.array([thing.name for thing in things], dtype=str),
+        "translations": np.array([item.translation for item in objects], dtype=np.float64).reshape(-1, 3),
+        "rotations": np.array([item.rotation for item in objects], dtype=np.float64).reshape(-1, 3, 3),
+        "categories": np.array([item.category for item in objects], dtype=np.int64),
+        "slots": np.array([item.slot for item in objects], dtype=np.int64),
+        "welded": np.array([item.welded for item in objects], dtype=bool),
+        "names": np.array([item.name for item in objects], dtype=str),
         "asset_names": np.array(scene.scene_type.assets, dtype=str),
         "scene_type": np.array(scene.scene_type.name),
     }

@@ -22,18 +22,13 @@ _CELL = 4
 
 
 class AssetFiles:
-    """Writer of asset files; each file is written when a format first asks for it.
+    """Writer of asset files; each file is written on first use.
 
     Args:
-        folder: the ``assets`` folder.
-        assets: all assets that may be asked for; their unique identifiers are derived from all names together.
-        friction: friction coefficient that formats write into their files.
-        package: a name for the whole export, for formats whose paths need one.
-
-    Attributes:
-        root: the ``assets`` folder.
-        friction: as given.
-        package: as given.
+        folder: Folder of the assets, ``root``.
+        assets: All assets of the export; their unique identifiers are derived from all names together.
+        friction: Friction coefficient that formats write into their files.
+        package: Name of the whole export, for formats whose paths need one.
     """
 
     def __init__(self, folder: Path, assets: Sequence[Asset], friction: float, package: str) -> None:
@@ -102,17 +97,11 @@ def visual_mesh(asset: Asset) -> trimesh.Trimesh:
 
 @dataclass(frozen=True, eq=False)
 class Palette:
-    """The colours of a mesh as a texture with one cell per colour.
+    """The colours of a mesh as a texture with one cell per colour."""
 
-    Attributes:
-        image: (H, W, 3) the texture.
-        uv: (K, 2) middle of each cell, v upward.
-        cells: (F,) cell of each face.
-    """
-
-    image: NDArray[np.uint8]
-    uv: Array
-    cells: NDArray[np.int64]
+    image: NDArray[np.uint8]  # (H, W, 3) the texture
+    uv: Array  # (K, 2) middle of each cell, v upward
+    cells: NDArray[np.int64]  # (F,) cell of each face
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> Palette:

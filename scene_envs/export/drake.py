@@ -33,8 +33,8 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene.dmd.yaml``; its package is the whole export, whose ``package.xml`` is written here too."""
     package = write_package(files)
     directives: list[dict[str, Any]] = []
-    for thing in scene.objects:
-        directives += _directives(thing, files, package)
+    for item in scene.objects:
+        directives += _directives(item, files, package)
     path = folder / "scene.dmd.yaml"
     text = yaml.dump({"directives": directives}, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=200)
     path.write_text(text)
@@ -42,17 +42,17 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
 
 
 def write_package(files: AssetFiles) -> str:
-    """Write ``package.xml`` into the export folder unless it is there already; returns the name in it.
+    """Write ``package.xml`` into the export folder unless it exists; returns the name in it.
 
     Raises:
-        InvalidInputError: a file of this name is there and names no package.
+        InvalidInputError: a file of this name exists and names no package.
     """
     path = files.root.parent / "package.xml"
     if path.exists() and (text := path.read_text().strip()):
         found = re.search(r"<name>\s*([^<\s]+)\s*</name>", text)
         if not found:
             raise InvalidInputError(
-                f"{path} has no <name>, so that Drake cannot find the assets beside it; name the package there, or "
+                f"{path} has no <name>, so that Drake cannot find the assets; name the package there, or "
                 "export into another folder"
             )
         return found[1]
@@ -64,17 +64,17 @@ def write_package(files: AssetFiles) -> str:
     return files.package
 
 
-def _directives(thing: PlacedObject, files: AssetFiles, package: str) -> list[dict[str, Any]]:
-    link = files.name(thing.asset)
-    file = f"package://{package}/{relative(asset_urdf(thing.asset, files), files.root.parent)}"
-    model: dict[str, Any] = {"name": thing.name, "file": file}
-    angle, axis = angle_axis(thing.rotation)
+def _directives(item: PlacedObject, files: AssetFiles, package: str) -> list[dict[str, Any]]:
+    link = files.name(item.asset)
+    file = f"package://{package}/{relative(asset_urdf(item.asset, files), files.root.parent)}"
+    model: dict[str, Any] = {"name": item.name, "file": file}
+    angle, axis = angle_axis(item.rotation)
     pose = {
-        "translation": thing.translation.tolist(),
+        "translation": item.translation.tolist(),
         "rotation": _AngleAxis(angle_deg=angle, axis=axis.tolist()),
     }
-    if not thing.welded:
+    if not item.welded:
         model["default_free_body_pose"] = {link: {"base_frame": "world", **pose}}
         return [{"add_model": model}]
-    weld = {"parent": "world", "child": f"{thing.name}::{link}", "X_PC": pose}
+    weld = {"parent": "world", "child": f"{item.name}::{link}", "X_PC": pose}
     return [{"add_model": model}, {"add_weld": weld}]

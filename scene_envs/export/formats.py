@@ -1,4 +1,4 @@
-"""Registry of export formats: built-in ones, those of installed packages, and yours."""
+"""Registry of export formats: built-in ones, those of installed packages, and users' own."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from scene_envs.export.placed import PlacedScene
 
 SceneWriter = Callable[["PlacedScene", "AssetFiles", Path], Path]
-"""Writes one scene into its folder and files of assets into the assets' folders, and returns the main file."""
+"""Function that writes one scene into its folder and assets into theirs, and returns the main file."""
 
 ENTRY_POINT_GROUP = "scene_envs.export_formats"
 """Packages offer formats under this group: an entry named after the format, whose value is a SceneWriter."""
@@ -28,11 +28,11 @@ class ExportFormat:
     """One format.
 
     Attributes:
-        name: what to write after ``formats=``.
-        summary: one line for listings.
-        write: the writer, or where it is, as ``"module:function"``.
-        requires: module that must be importable to write it; empty for none.
-        install: what to install to get that module.
+        name: Name of the format in ``formats=``.
+        summary: One line for listings.
+        write: Writer, or its place as ``"module:function"``.
+        requires: Module that the writer imports; empty for none.
+        install: Package that holds this module.
     """
 
     name: str

@@ -16,13 +16,13 @@ Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
-    """``scene.glb``: a node per object under a node ``z_up``, which turns our frame to that of glTF."""
+    """``scene.glb``: a node per object under a node ``z_up``, which turns the world frame to that of glTF."""
     graph = trimesh.Scene(base_frame="world")
     graph.graph.update("z_up", "world", matrix=Y_UP)
     for asset in scene.assets:
         graph.geometry[files.name(asset)] = files.textured(asset)
-    for thing in scene.objects:
-        graph.graph.update(thing.name, "z_up", matrix=thing.matrix, geometry=files.name(thing.asset))
+    for item in scene.objects:
+        graph.graph.update(item.name, "z_up", matrix=item.matrix, geometry=files.name(item.asset))
     path = folder / "scene.glb"
     path.write_bytes(export_glb(graph, include_normals=True))
     return path

@@ -39,8 +39,8 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     _add_view(root, shared, world, scene.scene_type.camera)
     for asset in scene.assets:
         _add_asset(shared, asset, files)
-    for thing in scene.objects:
-        _add_body(world, thing, files)
+    for item in scene.objects:
+        _add_body(world, item, files)
     return write_xml(root, folder / "scene.xml")
 
 
@@ -54,11 +54,11 @@ def _add_asset(parent: ET.Element, asset: Asset, files: AssetFiles) -> None:
         ET.SubElement(parent, "mesh", name=f"{name}_{part.stem}", file=relative(part, files.root))
 
 
-def _add_body(world: ET.Element, thing: PlacedObject, files: AssetFiles) -> None:
-    asset, name = thing.asset, files.name(thing.asset)
-    body = ET.SubElement(world, "body", name=thing.name, pos=numbers(thing.translation), quat=numbers(thing.quaternion))
-    if not thing.welded:
-        ET.SubElement(body, "freejoint", name=thing.name)
+def _add_body(world: ET.Element, item: PlacedObject, files: AssetFiles) -> None:
+    asset, name = item.asset, files.name(item.asset)
+    body = ET.SubElement(world, "body", name=item.name, pos=numbers(item.translation), quat=numbers(item.quaternion))
+    if not item.welded:
+        ET.SubElement(body, "freejoint", name=item.name)
         moments, axes = principal_inertia(asset.inertia)
         ET.SubElement(
             body,

@@ -14,13 +14,9 @@ from numpy.typing import NDArray
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import Asset
-from scene_envs.errors import InvalidInputError
 from scene_envs.rotations import matrix_to_quaternion, project_to_so3
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import SceneBatch, require_rigid_poses
 from scene_envs.scene_types import SceneType
-
-_ORTHOGONAL = 1e-3
-"""Largest entry of R^T R - I that still passes for a rotation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,13 +24,13 @@ class PlacedObject:
     """One object of a scene.
 
     Attributes:
-        name: unique in the scene, an identifier in every format, such as ``"teacup_0"``.
-        asset: the model.
-        slot: the row of the scene it stands in.
-        category: index of the asset in its scene type.
+        name: Unique name in the scene and identifier in every format, such as ``"teacup_0"``.
+        asset: Asset of the object.
+        slot: Row of the scene.
+        category: Index of the asset in its scene type.
         translation: (3,) float64 m, world frame.
         rotation: (3, 3) float64, asset frame to world frame, orthonormal to machine precision.
-        welded: True when it is fixed to the world.
+        welded: Whether the object is fixed to the world.
     """
 
     name: str
@@ -63,10 +59,10 @@ class PlacedScene:
     """One scene.
 
     Attributes:
-        index: its place in the batch.
-        scene_type: its scene type.
-        slots: rows of the scene, empty ones included.
-        objects: what is in it, in slot order.
+        index: Index in the batch.
+        scene_type: Scene type of the scene.
+        slots: Number of rows of the scene, empty ones included.
+        objects: Objects in slot order.
     """
 
     index: int
@@ -77,25 +73,25 @@ class PlacedScene:
     @property
     def assets(self) -> tuple[Asset, ...]:
         """The assets in use, each once, in category order."""
-        used = {thing.category: thing.asset for thing in self.objects}
+        used = {item.category: item.asset for item in self.objects}
         return tuple(used[category] for category in sorted(used))
 
 
 def place(batch: SceneBatch) -> list[PlacedScene]:
     """The scenes of a batch with exact poses and unique names.
 
-    Rotations come in single precision. They become doubles on SO(3) that differ from the given ones by no more than
-    their rounding. Objects are named after their asset and numbered in slot order. An asset without mass is welded.
+    Rotations in single precision become doubles on SO(3) that differ from the given ones by no more than their
+    rounding. Objects are named after their asset and numbered in slot order. An asset without mass is welded.
 
     Raises:
-        InvalidInputError: a matrix is not a rotation; the message names its scene and slot.
+        InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
 
     >>> scene = place(SceneBatch.empty("dimsum_table", 1))[0]
-    >>> [(thing.name, thing.welded) for thing in scene.objects]
+    >>> [(item.name, item.welded) for item in scene.objects]
     [('cafe_table_0', True)]
     """
     batch = batch.to("cpu")
-    _check(batch)
+    require_rigid_poses(batch)
     scene_type, library = batch.scene_type, batch.scene_type.library
     names = identifiers(library.names)
     translations = batch.translations.double().numpy()
@@ -188,16 +184,3 @@ def number(value: float) -> str:
 def numbers(values: Sequence[float] | Array) -> str:
     """Several numbers as :func:`number` writes them, separated by spaces."""
     return " ".join(number(value) for value in np.asarray(values, dtype=np.float64).ravel())
-
-
-def _check(batch: SceneBatch) -> None:
-    product = batch.rotations.transpose(-1, -2) @ batch.rotations - torch.eye(3)
-    rotation = (product.abs().amax(dim=(-1, -2)) < _ORTHOGONAL) & (torch.linalg.det(batch.rotations) > 0)
-    bad = torch.nonzero(~batch.is_empty & ~rotation)
-    if len(bad):
-        scene, slot = bad[0].tolist()
-        raise InvalidInputError(
-            f"scene {scene}, slot {slot} holds a matrix that is not a rotation: "
-            f"{batch.rotations[scene, slot].flatten().tolist()}; SceneBatch.from_tensor makes valid poses of a "
-            "sampler's output"
-        )

@@ -20,17 +20,17 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     _text(light, "pose", "0 0 10 0 0 0")
     _text(light, "direction", "-0.3 0.4 -1")
     _text(light, "diffuse", "0.9 0.9 0.9 1")
-    for thing in scene.objects:
-        _add_model(world, thing, files, folder)
+    for item in scene.objects:
+        _add_model(world, item, files, folder)
     return write_xml(root, folder / "world.sdf")
 
 
-def _add_model(world: ET.Element, thing: PlacedObject, files: AssetFiles, folder: Path) -> None:
-    asset = thing.asset
-    model = ET.SubElement(world, "model", name=thing.name)
-    pose = _text(model, "pose", numbers(np.concatenate([thing.translation, np.roll(thing.quaternion, -1)])))
+def _add_model(world: ET.Element, item: PlacedObject, files: AssetFiles, folder: Path) -> None:
+    asset = item.asset
+    model = ET.SubElement(world, "model", name=item.name)
+    pose = _text(model, "pose", numbers(np.concatenate([item.translation, np.roll(item.quaternion, -1)])))
     pose.set("rotation_format", "quat_xyzw")
-    if thing.welded:
+    if item.welded:
         _text(model, "static", "true")
     link = ET.SubElement(model, "link", name=files.name(asset))
     if asset.mass > 0:

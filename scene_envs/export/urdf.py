@@ -24,14 +24,14 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``objects.json``: name, URDF, pose and whether it is welded, per object; URDFs go into the assets' folders."""
     objects = [
         {
-            "name": thing.name,
-            "urdf": relative(asset_urdf(thing.asset, files), folder),
-            "bullet_urdf": relative(bullet_urdf(thing.asset, files), folder),
-            "translation": thing.translation.tolist(),
-            "quaternion_wxyz": thing.quaternion.tolist(),
-            "welded": thing.welded,
+            "name": item.name,
+            "urdf": relative(asset_urdf(item.asset, files), folder),
+            "bullet_urdf": relative(bullet_urdf(item.asset, files), folder),
+            "translation": item.translation.tolist(),
+            "quaternion_wxyz": item.quaternion.tolist(),
+            "welded": item.welded,
         }
-        for thing in scene.objects
+        for item in scene.objects
     ]
     path = folder / "objects.json"
     path.write_text(json.dumps({"scene_type": scene.scene_type.name, "objects": objects}, indent=1) + "\n")

@@ -27,15 +27,15 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     physics = UsdPhysics.Scene.Define(stage, "/World/physics_scene")
     physics.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
     physics.CreateGravityMagnitudeAttr(GRAVITY)
-    for thing in scene.objects:
-        prim = UsdGeom.Xform.Define(stage, f"/World/{thing.name}")
-        prim.GetPrim().GetReferences().AddReference(Sdf.Reference(relative(asset_usd(thing.asset, files), folder)))
-        prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*thing.translation.tolist()))
-        w, x, y, z = thing.quaternion.tolist()
+    for item in scene.objects:
+        prim = UsdGeom.Xform.Define(stage, f"/World/{item.name}")
+        prim.GetPrim().GetReferences().AddReference(Sdf.Reference(relative(asset_usd(item.asset, files), folder)))
+        prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*item.translation.tolist()))
+        w, x, y, z = item.quaternion.tolist()
         prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
-        if not thing.welded:
+        if not item.welded:
             UsdPhysics.RigidBodyAPI.Apply(prim.GetPrim())
-            _apply_mass(prim.GetPrim(), thing.asset)
+            _apply_mass(prim.GetPrim(), item.asset)
     stage.GetRootLayer().Save()
     return path
 
@@ -85,7 +85,7 @@ def _new_stage(path: Path) -> Any:
     """An empty stage in metres and kilograms with z up, replacing the file at ``path``."""
     from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
-    layer = Sdf.Layer.Find(str(path))  # a layer that this process wrote before is still in memory
+    layer = Sdf.Layer.Find(str(path))  # a layer that this process wrote is still in memory
     if layer:
         layer.Clear()
     else:

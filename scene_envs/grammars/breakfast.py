@@ -23,7 +23,7 @@ CROCK_RADIUS = 0.055
 """Inner radius of the utensil crock, m."""
 
 ALONG = Yaw(std=0.06)
-"""Cutlery beside the plate points to the middle of the table."""
+"""Turn of cutlery next to the plate: it points to the middle of the table."""
 ACROSS = Yaw(std=0.06, choices=(math.pi / 2, -math.pi / 2))
 """Cutlery above the plate lies across."""
 

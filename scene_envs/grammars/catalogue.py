@@ -1,4 +1,4 @@
-"""Registry of grammars: built-in ones, those of installed packages, and yours."""
+"""Registry of grammars: built-in ones, those of installed packages, and users' own."""
 
 from __future__ import annotations
 

@@ -30,8 +30,8 @@ class Standing:
     """Long objects (long axis x, heavier end toward +x) that stand in a jar, heavier end up, leaning outward.
 
     Attributes:
-        node: draws the contents.
-        radius: inner radius of the jar, m.
+        node: Node that draws the contents.
+        radius: Inner radius of the jar, m.
     """
 
     node: Node
@@ -66,9 +66,9 @@ class Heap:
     """Objects poured into a bowl one above the other, turned at random.
 
     Attributes:
-        node: draws the contents.
-        radius: how far (m) from the middle they start.
-        upright: True keeps their own vertical axis vertical at the start.
+        node: Node that draws the contents.
+        radius: Largest distance (m) of the contents from the middle at the start.
+        upright: Whether the vertical axis of each object is vertical at the start.
     """
 
     node: Node
@@ -101,11 +101,7 @@ class Heap:
 
 
 class Containers:
-    """Fills containers of one scene type.
-
-    Args:
-        scene_type: the scene type whose assets are used.
-    """
+    """Filled containers of one scene type."""
 
     def __init__(self, scene_type: SceneType) -> None:
         self._scene_type = scene_type
@@ -114,7 +110,7 @@ class Containers:
     def fill(
         self, container: str, contents: Sequence[str], filling: Filling, rng: np.random.Generator, reasons: Counter[str]
     ) -> list[ContentPose] | None:
-        """Poses of the contents at rest in the container's frame; None when they would not stay in it."""
+        """Poses of the contents at rest in the container's frame; None when they do not stay in it."""
         from scene_envs.physics import feasibility, project, settle
 
         library = self._scene_type.library

@@ -26,10 +26,10 @@ class Gaussian:
     """A normal distribution of positions in the plane of a support.
 
     Attributes:
-        x, y: mean, m, in the support's frame.
-        along: standard deviation (m) along ``direction``.
-        across: standard deviation (m) across it; the same as ``along`` when None.
-        direction: angle of the first axis from +x, rad.
+        x, y: Mean in the support's frame, m.
+        along: Standard deviation (m) along ``direction``.
+        across: Standard deviation (m) across it; None means that of ``along``.
+        direction: Angle of the first axis from +x, rad.
     """
 
     x: float = 0.0
@@ -102,7 +102,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Moved:
-    """A distribution in a frame of its own, which stands at (``x``, ``y``) m, turned by ``yaw`` rad."""
+    """A distribution in its own frame at (``x``, ``y``) m, turned by ``yaw`` rad."""
 
     distribution: PositionDistribution
     x: float
@@ -127,8 +127,8 @@ class Yaw:
     """Turn of a child about the vertical: one of ``choices`` plus a normal deviate.
 
     Attributes:
-        std: standard deviation, rad; infinite for any angle.
-        choices: angles (rad) of the object's +x axis from the support's, equally likely.
+        std: Standard deviation, rad; infinite for any angle.
+        choices: Angles (rad) of the object's +x axis from the support's, equally likely.
     """
 
     std: float = math.inf

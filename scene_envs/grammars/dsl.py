@@ -28,12 +28,12 @@ class Object:
     """One object at a distribution of places, with the objects on it and in it.
 
     Attributes:
-        asset: asset name.
-        where: the distribution of its place, in the frame of its support; its middle by default.
-        yaw: how it is turned; any angle by default.
-        on: surfaces that it carries, in its own frame: a shelf's tiers, the middle of a plate, the floor of a bowl.
-        inside: things that come to rest in it under gravity: cutlery in a crock, fruit in a bowl.
-        beside: what stands next to it on the same support, at places in its frame: chairs around a table.
+        asset: Asset name.
+        where: Distribution of its place, in the frame of its support; the middle of the support by default.
+        yaw: Distribution of its turn about the vertical; any angle by default.
+        on: Surfaces that it carries, in its own frame: a shelf's tiers, the middle of a plate, the floor of a bowl.
+        inside: Contents that come to rest in it under gravity: cutlery in a crock, fruit in a bowl.
+        beside: Neighbours on the same support, at places in its frame: chairs around a table.
     """
 
     asset: str
@@ -67,9 +67,9 @@ class Cluster:
     """Nodes whose places are relative to one random place: the settings on two sides of a table.
 
     Attributes:
-        member: what stands there.
-        where: the distribution of the common place.
-        yaw: how the whole is turned; not at all by default.
+        member: Node at the common place.
+        where: Distribution of the common place.
+        yaw: Distribution of the common turn about the vertical; none by default.
     """
 
     member: Node
@@ -86,12 +86,12 @@ class Stack:
     """A stack of random height: after each ``base``, one of ``then``.
 
     Attributes:
-        base: the asset that carries others.
-        then: weights of what comes next: ``base`` (go on), another asset (ends the stack), or None (ends it).
-        step: height (m) by which each level rises; None puts each on the top of the one below.
-        where: the distribution of the stack's axis; the middle of the support by default.
-        at_most: objects in the stack, at most; drawn again when it grows higher.
-        yaw: how each object is turned; any angle by default.
+        base: Asset that carries others.
+        then: Weights of the next level: ``base`` (go on), another asset (ends the stack), or None (ends it).
+        step: Height (m) of each level; None puts each on the top of the one below.
+        where: Distribution of the stack's axis; the middle of the support by default.
+        at_most: Largest number of objects in the stack; a higher stack is drawn again.
+        yaw: Distribution of the turn of each object; any angle by default.
 
     Raises:
         InvalidInputError: negative weights, or a stack that never ends.
@@ -109,7 +109,7 @@ class Stack:
     yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
 
     def __post_init__(self) -> None:
-        _check_weights("Stack", self.then.values())
+        _require_weights("Stack", self.then.values())
         if self.at_most < 1 or not any(weight for asset, weight in self.then.items() if asset != self.base):
             raise InvalidInputError(
                 f"a Stack of {self.base!r} needs at_most >= 1 and, in `then`, another asset or None with a positive "
@@ -140,9 +140,9 @@ class Pile:
 
     Attributes:
         members: (weight, asset) options for every level.
-        height: the distribution of the number of objects.
-        where: the distribution of the pile's axis; the middle of the support by default.
-        yaw: how each object is turned; any angle by default.
+        height: Distribution of the number of objects.
+        where: Distribution of the pile's axis; the middle of the support by default.
+        yaw: Distribution of the turn of each object; any angle by default.
     """
 
     members: tuple[tuple[float, str], ...]
@@ -151,7 +151,7 @@ class Pile:
     yaw: Yaw = Yaw()  # noqa: RUF009  (frozen)
 
     def __post_init__(self) -> None:
-        _check_weights("Pile", [weight for weight, _ in self.members])
+        _require_weights("Pile", [weight for weight, _ in self.members])
 
     @cached_property
     def _cumulative(self) -> list[float]:
@@ -188,7 +188,7 @@ class OneOf:
     options: tuple[tuple[float, Node], ...]
 
     def __init__(self, *options: tuple[float, Node]) -> None:
-        _check_weights("OneOf", [weight for weight, _ in options])
+        _require_weights("OneOf", [weight for weight, _ in options])
         object.__setattr__(self, "options", options)
 
     @cached_property
@@ -242,8 +242,7 @@ class Geometric:
 class Repeat:
     """A node several times, drawn again until every condition in ``such_that`` holds.
 
-    Because nodes are independent, drawing only this node again gives the same distribution as
-    rejecting the whole scene.
+    Nodes are independent, so drawing this node again gives the same distribution as rejecting the whole scene.
     """
 
     node: Node
@@ -260,6 +259,6 @@ class Repeat:
         raise InvalidInputError(f"a grammar's condition {failed!r} did not hold in 100,000 draws; it cannot be met")
 
 
-def _check_weights(word: str, weights: Collection[float]) -> None:
+def _require_weights(word: str, weights: Collection[float]) -> None:
     if not all(weight >= 0 for weight in weights) or not sum(weights) > 0:
         raise InvalidInputError(f"{word} needs weights >= 0 with a positive sum, got {list(weights)}")

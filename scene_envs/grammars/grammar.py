@@ -21,7 +21,7 @@ from scene_envs.scene_types.built_in import BUILT_IN
 from scene_envs.scene_types.registry import PLUGINS
 
 _MAX_STRUCTURES = 10_000
-"""Structures drawn for one scene before the grammar is called impossible."""
+"""Number of structures drawn for one scene before an error that the grammar is impossible."""
 _MAX_WITHOUT_ROOM = 100
 """Structures in a row that may fail for lack of room."""
 
@@ -34,12 +34,12 @@ class Grammar:
     are settled in simulation.
 
     Attributes:
-        name: the registered name.
-        scene_type: the scene type, or its name.
-        surfaces: the supports with their children.
-        such_that: named conditions on all towers of a scene, those that stand on others included; a structure that
-            fails one is rejected.
-        reasons: number of rejected draws by reason since the grammar was made.
+        name: Registered name.
+        scene_type: Scene type, or its name.
+        surfaces: Supports with their children.
+        such_that: Named conditions on all towers of a scene, those on other towers included; a structure that fails
+            one is rejected.
+        reasons: Number of rejected draws by reason since the grammar was made.
 
     >>> from scene_envs.grammars import get_grammar
     >>> grammar = get_grammar("dimsum_table")

@@ -16,7 +16,7 @@ from scene_envs.grammars.towers import Surface, Tower
 from scene_envs.scene_types import SceneType
 
 _SPOTS = 20
-"""Places tried for an object that has others beside it."""
+"""Places tried for an object with neighbours."""
 
 Rotation = tuple[float, ...]
 """A rotation matrix, row-major."""
@@ -49,12 +49,7 @@ class Pose:
 
 
 class Layout:
-    """Places structures of one scene type.
-
-    Args:
-        scene_type: the scene type.
-        reasons: where failures are counted.
-    """
+    """Layout of structures of one scene type; failures are counted in ``reasons``."""
 
     def __init__(self, scene_type: SceneType, reasons: Counter[str]) -> None:
         self.library = scene_type.library
@@ -67,14 +62,10 @@ class Layout:
     def place(
         self, surface: Surface, towers: Sequence[Tower], frame: Frame, carrier: str | None, rng: np.random.Generator
     ) -> list[Pose] | None:
-        """Poses of everything on ``surface``, or None when it does not fit.
+        """Poses of the ``towers`` on ``surface`` and of everything on them, or None when they do not fit.
 
-        Args:
-            surface: the surface.
-            towers: what stands on it.
-            frame: the frame of the object that carries it; the world frame when no object does.
-            carrier: asset that carries it, if any.
-            rng: random generator.
+        ``frame`` is the frame of the ``carrier``, the asset that carries the surface; it is the world frame without
+        a carrier.
         """
         if surface.height is not None:
             level = surface.height
@@ -111,7 +102,7 @@ class Layout:
     def _add(
         self, free: FreeSurface, surface: Surface, tower: Tower, frame: Frame, height: float, rng: np.random.Generator
     ) -> list[Pose] | None:
-        """One tower with all that is on it, in it and beside it."""
+        """One tower with everything on it, in it and next to it."""
         if not tower.assets:
             return self._loads(tower, replace(frame, z=height), None, rng)
         outline, mark = self._outline(surface, tower.assets), free.mark()
@@ -171,10 +162,8 @@ class Layout:
             poses.append(Pose(asset, (x, y, frame.z + float(translation[2])), turned))
         return poses
 
-    # -- facts about assets, looked up once ---------------------------------------------------------
-
     def _height(self, asset: str) -> tuple[float, float, float]:
-        """z of the foot, of the top, and of where something rests in the middle, m, asset frame."""
+        """z of the foot, of the top, and of an object at rest in the middle, m, asset frame."""
         if asset not in self._heights:
             model = self.library[asset]
             self._heights[asset] = foot_of(model), top_of(model), carrying_height(model)

@@ -64,13 +64,13 @@ def drinks(asset: str, p: float) -> Node:
     return Repeat(Object(asset, anywhere()), Geometric(p, 0, 6))
 
 
-def things(toy: float, game: float, p: float) -> Node:
+def tier_objects(toy: float, game: float, p: float) -> Node:
     """Objects of one tier.
 
     Args:
-        toy: chance of the book and of each toy.
-        game: chance of small games and of a plate.
-        p: how quickly the numbers of game cases, cans and bottles fall off.
+        toy: Chance of the book and of each toy.
+        game: Chance of small games and of a plate.
+        p: Parameter of the geometric distributions of the numbers of game cases, cans and bottles.
     """
     return Group(
         maybe(toy, bookend()),
@@ -86,11 +86,11 @@ def things(toy: float, game: float, p: float) -> Node:
 
 
 def inner_tier() -> Node:
-    return OneOf((0.48, things(toy=0.12, game=0.08, p=0.85)), (0.08, large_games()), (0.44, NOTHING))
+    return OneOf((0.48, tier_objects(toy=0.12, game=0.08, p=0.85)), (0.08, large_games()), (0.44, NOTHING))
 
 
 def full_tier() -> Node:
-    return OneOf((0.9, things(toy=0.3, game=0.4, p=0.55)), (0.1, large_games()))
+    return OneOf((0.9, tier_objects(toy=0.3, game=0.4, p=0.55)), (0.1, large_games()))
 
 
 def top_tier() -> Node:

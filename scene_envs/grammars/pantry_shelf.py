@@ -34,7 +34,7 @@ def fruit_bowl() -> Node:
 
 
 def pantry(p: float) -> Node:
-    """The whole shelf; ``p`` says how quickly the numbers of a kind fall off."""
+    """The whole shelf; ``p`` is the parameter of the geometric distribution of the number of each kind."""
     top = Group(maybe(0.2, fruit_bowl()), goods(p))
     return Tiers(tiers(goods(p), top))
 

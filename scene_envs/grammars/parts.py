@@ -1,4 +1,4 @@
-"""Small parts that several scene types share: optional nodes, objects in the middle of others, conditions."""
+"""Parts that several scene types share: optional nodes, objects in the middle of others, conditions."""
 
 from __future__ import annotations
 

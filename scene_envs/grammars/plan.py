@@ -34,8 +34,8 @@ class Rectangle:
     """An axis-aligned rectangle in the frame of an object.
 
     Attributes:
-        half_x, half_y: half sides, m.
-        center_x, center_y: where its centre lies in the object frame, m.
+        half_x, half_y: Half sides, m.
+        center_x, center_y: Centre in the object frame, m.
     """
 
     half_x: float
@@ -135,9 +135,6 @@ def _apart(box: Placed, other: Placed) -> bool:
         or min(across) >= plan.half_y
         or max(across) <= -plan.half_y
     )
-
-
-# -- facts about assets ---------------------------------------------------------------------------
 
 
 def plan_of(asset: Asset) -> Plan:

@@ -49,11 +49,11 @@ def laid(
     """A table with its chairs, places, stacks of steamers, dishes and teapots.
 
     Args:
-        stacks: how many stacks of steamers.
-        another, lid, nothing: weights of what comes after each steamer.
-        setting, empty: weights of a plate with a cup, and of nothing, on each side of the table; a plate alone and
+        stacks: Distribution of the number of stacks of steamers.
+        another, lid, nothing: Weights of another steamer, a lid and nothing after each steamer.
+        setting, empty: Weights of a plate with a cup, and of nothing, on each side of the table; a plate alone and
             a cup alone have 0.05 each.
-        dishes, teapots: chances that there are one or two of them.
+        dishes, teapots: Chances of one or two of them.
     """
     then = {"steamer_bottom": another, "steamer_lid": lid, None: nothing}
     steamers = Repeat(Stack("steamer_bottom", then, step=dimsum.STEP, where=Gaussian(along=0.158), at_most=10), stacks)
@@ -74,7 +74,7 @@ def tables(numbers: Mapping[int, float], table: Node) -> Node:
 
 
 def stack_of_three(towers: Sequence[Tower]) -> bool:
-    """Whether a stack of at least three steamers, lid included, stands somewhere."""
+    """Whether a stack of at least three steamers, lid included, exists."""
     parts = (part for tower in towers for part in tower.walk())
     return any(len(part.assets) >= 3 and part.assets[0] == "steamer_bottom" for part in parts)
 

@@ -17,8 +17,8 @@ _DRAWS = 24
 """Draws from a child's own distribution before the free region is enumerated."""
 _CELL = 0.02
 """Side of the cells (m) in which a crowded free region is enumerated; larger where the region is larger than 2 m."""
-_MOST_CELLS = 100
-"""Cells along each side of a region, at most."""
+_MAX_CELLS = 100
+"""Largest number of cells along each side of a region."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Region:
     """Region of the frames of children: a rectangle cut by an optional disc, in the support's frame.
 
     Attributes:
-        half_x, half_y: half sides of the rectangle (m) in which object frames stay.
-        radius: radius (m) of the disc about the support's origin in which whole footprints stay.
-        overhang: how far (m) footprints may reach beyond the rectangle; 0 keeps all of them inside.
-        x, y: centre of the rectangle, m.
+        half_x, half_y: Half sides of the rectangle (m) in which object frames stay.
+        radius: Radius (m) of the disc about the support's origin in which whole footprints stay.
+        overhang: Largest distance (m) of footprints beyond the rectangle; 0 keeps all of them inside.
+        x, y: Centre of the rectangle, m.
     """
 
     half_x: float
@@ -63,14 +63,14 @@ class Region:
         """Bounds (m) for the frame of a child whose footprint holds a disc of radius ``foot``.
 
         Returns:
-            largest distance from the centre of the rectangle in x and in y, and from the support's origin.
+            Largest distance from the centre of the rectangle in x and in y, and from the support's origin.
         """
         over = min(0.0, self.overhang - foot)
         return self.half_x + over, self.half_y + over, max(0.0, self.radius - foot)
 
     @cached_property
     def _cells(self) -> tuple[NDArray[np.float64], float, float]:
-        nx, ny = (min(_MOST_CELLS, max(1, math.ceil(2 * half / _CELL))) for half in (self.half_x, self.half_y))
+        nx, ny = (min(_MAX_CELLS, max(1, math.ceil(2 * half / _CELL))) for half in (self.half_x, self.half_y))
         wide, deep = 2 * self.half_x / nx, 2 * self.half_y / ny
         xs = (np.arange(nx) + 0.5) * wide - self.half_x + self.x
         ys = (np.arange(ny) + 0.5) * deep - self.half_y + self.y
@@ -92,8 +92,8 @@ class Outline:
     """Area that a child needs on its support.
 
     Attributes:
-        keep_out: area that no other child's keep-out may meet; one plan per level of a stack.
-        footprint: area that must lie in the region; one plan per level.
+        keep_out: Area that no other child's keep-out may meet; one plan per level of a stack.
+        footprint: Area that must lie in the region; one plan per level.
     """
 
     keep_out: tuple[Plan, ...]
@@ -101,12 +101,12 @@ class Outline:
 
     @cached_property
     def core(self) -> float:
-        """Radius (m) of a disc about the frame that lies within the keep-out, whatever the yaw."""
+        """Radius (m) of a disc about the frame that lies within the keep-out at every yaw."""
         return max(inscribed(plan) for plan in self.keep_out)
 
     @cached_property
     def foot(self) -> float:
-        """Radius (m) of a disc about the frame that lies within the footprint, whatever the yaw."""
+        """Radius (m) of a disc about the frame that lies within the footprint at every yaw."""
         return max(inscribed(plan) for plan in self.footprint)
 
 
@@ -157,7 +157,7 @@ class FreeSurface:
         in proportion to its density.
 
         Returns:
-            x, y (m) and the yaw (rad) of each of its ``levels``.
+            Position x, y (m), and the yaw (rad) of each of its ``levels``.
         """
         region = self.region
         half_x, half_y, radius = region.limits(outline.foot)

@@ -25,14 +25,14 @@ class Tower:
     """Objects on one vertical axis, bottom first.
 
     Attributes:
-        assets: asset names from the bottom up.
-        where: the distribution of the axis, in the frame of the support.
-        step: height (m) between the frames of neighbours; None stacks each on the top of the one below.
-        yaw: how each object is turned.
-        loads: what stands on the bottom object: surfaces, each with its towers.
-        contents: assets inside the bottom object, which come to rest in it.
-        filling: how the contents get there.
-        beside: towers on the same support whose places are in the frame of the bottom object.
+        assets: Asset names from the bottom up.
+        where: Distribution of the axis, in the frame of the support.
+        step: Height (m) between the frames of neighbours; None stacks each on the top of the one below.
+        yaw: Distribution of the turn of each object.
+        loads: Surfaces on the bottom object, each with its towers.
+        contents: Assets inside the bottom object, which come to rest in it.
+        filling: Rule for the poses of the contents before they come to rest.
+        beside: Towers on the same support whose places are in the frame of the bottom object.
 
     A tower without assets consists of its loads alone: surfaces in the frame of the object that carries the tower.
     """
@@ -47,33 +47,33 @@ class Tower:
     beside: tuple[Tower, ...] = ()
 
     def walk(self) -> Iterator[Tower]:
-        """This tower and all that stand on it or beside it, recursively."""
+        """This tower and all towers on it or next to it, recursively."""
         yield self
         for towers in (*(towers for _, towers in self.loads), self.beside):
             for tower in towers:
                 yield from tower.walk()
 
     def moved(self, x: float, y: float, yaw: float) -> Tower:
-        """The same tower in a frame that stands at (``x``, ``y``) m, turned by ``yaw`` rad."""
+        """The same tower in a frame at (``x``, ``y``) m, turned by ``yaw`` rad."""
         return replace(self, where=Moved(self.where, x, y, yaw), yaw=self.yaw.turned(yaw))
 
     def count(self) -> int:
-        """Objects in this tower, on it, in it and beside it."""
+        """Number of objects in this tower, on it, in it and next to it."""
         return sum(len(tower.assets) + len(tower.contents) for tower in self.walk())
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A horizontal support of a grammar, with what stands on it.
+    """A horizontal support of a grammar, with its children.
 
     Attributes:
-        children: what stands here; drawn and placed in this order.
-        region: where children may stand.
-        keep_out: per asset, radius (m) of a disc that no other keep-out may meet; by default the asset's plan.
-        footprint: per asset, radius (m) of a disc that must lie wholly on the support; by default the asset's plan.
-        height: z of the surface (m), in the world or in the frame of the object that carries it; None takes the
-            height at which something rests in the middle of that object.
-        layouts: how often the whole layout is tried before the structure is thrown away.
+        children: Nodes on the support, drawn and placed in this order.
+        region: Region of the children.
+        keep_out: Radius (m) by asset of a disc that no other keep-out may meet; the asset's plan by default.
+        footprint: Radius (m) by asset of a disc that must lie wholly on the support; the asset's plan by default.
+        height: Height z of the surface (m), in the world or in the frame of the object that carries it; None takes the
+            height at which an object rests in the middle of that object.
+        layouts: Number of tries of the whole layout before the structure is rejected.
     """
 
     children: Sequence[Node]
@@ -92,7 +92,7 @@ class Node(Protocol):
     """Anything that draws towers."""
 
     def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
-        """Draw towers; count in ``reasons`` why draws were thrown away."""
+        """Draw towers, and count rejected draws by reason in ``reasons``."""
 
 
 class Filling(Protocol):
@@ -100,7 +100,7 @@ class Filling(Protocol):
 
     @property
     def node(self) -> Node:
-        """Draws the contents; only their asset names count."""
+        """Node that draws the contents; only their asset names count."""
 
     def start(self, container: Asset, contents: Sequence[Asset], rng: np.random.Generator) -> list[ContentPose]:
-        """A pose for each of ``contents`` from which gravity takes it into the container."""
+        """A start pose for each of ``contents``, from which it falls into the container."""

@@ -1,4 +1,4 @@
-"""The public functions of the physics: batches of scenes in, results per scene and object out."""
+"""Public functions of the physics: batches of scenes in, results per scene and object out."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from scene_envs.scene import SceneBatch
 
 
 def check_numbers(duration: float, **limits: float) -> None:
-    """Refuse a duration that is not a positive number, and limits that are negative or NaN.
+    """Raise InvalidInputError for a duration that is not a positive number, and for limits that are negative or NaN.
 
     >>> check_numbers(0.1, max_rotation=float("inf"))
     """
@@ -53,10 +53,10 @@ def feasibility(
 
     Args:
         batch: B scenes of N slots.
-        max_penetration: m.
-        max_displacement: m, of the object frame.
-        max_rotation: rad, geodesic.
-        duration: s.
+        max_penetration: Largest overlap with another object, m.
+        max_displacement: Largest motion of the object frame, m.
+        max_rotation: Largest geodesic angle of rotation, rad.
+        duration: Simulated time, s.
         pool: worker processes; None computes in this process.
 
     Raises:
@@ -148,8 +148,8 @@ def settle(
 
     Args:
         batch: B scenes of N slots.
-        duration: s.
-        iterations: of the contact solver per step; more of them leave smaller overlaps.
+        duration: Longest simulated time, s.
+        iterations: Iterations of the contact solver per step; more of them leave smaller overlaps.
         pool: worker processes; None computes in this process.
 
     Raises InvalidInputError, also for fewer than one iteration or a duration that is not positive, and

@@ -9,17 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.errors import InvalidInputError
 from scene_envs.physics.kernels import Chunk
 from scene_envs.physics.pool import PhysicsPool
 from scene_envs.rotations import geodesic_angle, project_to_so3
-from scene_envs.scene import SceneBatch
+from scene_envs.scene import SceneBatch, require_rigid_poses
 
 _LOGGER = logging.getLogger(__name__)
 _CHUNK = 8
 """Scenes per message to a worker."""
-_ORTHOGONAL = 1e-3
-"""Largest entry of R^T R - I that still passes for a rotation."""
 
 Rows = list[dict[str, Any] | None]
 """Results of a kernel, one per scene."""
@@ -35,16 +32,16 @@ def run_kernel(
     """Run a kernel on a batch: the results of each scene, None where it failed twice.
 
     Args:
-        kernel: name of a function of :data:`scene_envs.physics.kernels.KERNELS`.
+        kernel: Name of a function of :data:`scene_envs.physics.kernels.KERNELS`.
         batch: B scenes.
-        options: keyword arguments of the kernel.
-        pool: worker processes; None computes in this process.
+        options: Keyword arguments of the kernel.
+        pool: Worker processes; None computes in this process.
         units: (B,) float64, units that the simulation of each scene may spend; None derives them from its objects.
 
     Raises:
         InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
     """
-    _check(batch)
+    require_rigid_poses(batch)
     translations = batch.translations.double().cpu().numpy()
     rotations = batch.rotations.double().cpu().numpy()
     categories = batch.categories.cpu().numpy()
@@ -65,28 +62,13 @@ def run_kernel(
     return results
 
 
-def _check(batch: SceneBatch) -> None:
-    present = ~batch.is_empty
-    finite = torch.isfinite(batch.tensor[..., :12]).all(dim=-1)
-    product = batch.rotations.transpose(-1, -2) @ batch.rotations - torch.eye(3, device=batch.tensor.device)
-    rotation = (product.abs().amax(dim=(-1, -2)) < _ORTHOGONAL) & (torch.linalg.det(batch.rotations) > 0)
-    for good, what in ((finite, "a pose that is not finite"), (rotation, "a matrix that is not a rotation")):
-        bad = torch.nonzero(present & ~good)
-        if len(bad):
-            scene, slot = bad[0].tolist()
-            raise InvalidInputError(
-                f"scene {scene}, slot {slot} holds {what}: {batch.tensor[scene, slot, :12].tolist()}; "
-                "SceneBatch.from_tensor makes valid poses of a sampler's output"
-            )
-
-
 def valid_rows(rows: Rows) -> Tensor:
     """(B,) bool, scenes that were judged."""
     return torch.tensor([row is not None and bool(row["valid"]) for row in rows], dtype=torch.bool)
 
 
 def spent(rows: Rows) -> Tensor:
-    """(B,) float64, units of simulation that each scene took; infinitely many if the scene failed twice."""
+    """(B,) float64, units of simulation that each scene took; infinite if the scene failed twice."""
     return torch.tensor([np.inf if row is None else float(row["spent"]) for row in rows], dtype=torch.float64)
 
 

@@ -32,7 +32,7 @@ _PARKING = 1000.0
 _PARKING_STEP = 10.0 * SCALE
 _SPARE_BODIES = 64
 _SPARE_FACTOR = 3
-"""A pool is built anew when it has more bodies than this many times the bodies that a scene needs, plus
+"""A pool is built again when it has more bodies than this many times the bodies that a scene needs, plus
 ``_SPARE_BODIES``: in every step Bullet compares the boxes of all bodies, including parked ones."""
 _ZERO = (0.0, 0.0, 0.0)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -44,9 +44,6 @@ class BodyPool:
     Two properties keep the motion of a scene independent of the scenes before it. The broadphase is Bullet's simple
     one: it keeps no tree, and lists pairs in the order of the bodies. And a body that is placed or parked gets a
     fresh broadphase proxy, which drops its pairs, contacts and warm starts.
-
-    Args:
-        library: geometry of the assets.
 
     Raises:
         MissingDependencyError: pybullet is not installed.
@@ -74,7 +71,7 @@ class BodyPool:
         return self._frames[category]
 
     def take(self, needed: Mapping[BodyKey, int]) -> dict[BodyKey, list[int]]:
-        """Parked bodies: the first ``needed[key]`` of each key, whatever earlier calls took.
+        """The first ``needed[key]`` parked bodies of each key, independently of earlier calls.
 
         Raises:
             PhysicsError: PyBullet refuses a shape or a body.
@@ -132,8 +129,6 @@ class BodyPool:
             self.bullet.disconnect(self.client)
             self.client = -1
 
-    # -- construction ---------------------------------------------------------------------------
-
     def _build(self, sizes: Mapping[BodyKey, int]) -> None:
         bullet, client = self.bullet, self.client
         self.clear()  # an interrupt below must leave no ids of bodies that are gone
@@ -153,7 +148,7 @@ class BodyPool:
         bodies: dict[BodyKey, list[int]] = {}
         self._parking = {}
         with tempfile.TemporaryDirectory() as folder:
-            for key in sorted(sizes):  # the same order in every process, whatever was asked for first
+            for key in sorted(sizes):  # the same order in every process
                 shape = self._shape(key, Path(folder))
                 bodies[key] = []
                 for _ in range(sizes[key]):
@@ -189,12 +184,7 @@ class BodyPool:
         static = bool(self._library.static[category])
         mass = 0.0 if static else float(self._library.assets[category].asset.mass)
         body = self.bullet.createMultiBody(
-            mass,
-            shape,
-            visual,
-            basePosition=place,
-            useMaximalCoordinates=True,
-            physicsClientId=self.client,
+            mass, shape, visual, basePosition=place, useMaximalCoordinates=True, physicsClientId=self.client
         )
         if body < 0:
             raise PhysicsError(f"PyBullet could not create a body for asset category {category}")

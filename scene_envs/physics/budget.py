@@ -9,12 +9,12 @@ import numpy as np
 from scene_envs.physics.pairs import ObjectPairs
 from scene_envs.physics.placement import Objects
 
-PER_SCENE, PER_OBJECT, PER_PAIR, MOST_PER_OBJECT = 1_000.0, 1_200.0, 500.0, 10_000.0
+PER_SCENE, PER_OBJECT, PER_PAIR, MAX_PER_OBJECT = 1_000.0, 1_200.0, 500.0, 10_000.0
 """Units of simulation (see :class:`Budget`) that a scene may take: ``PER_SCENE``, plus ``PER_OBJECT`` for each free
 object, plus ``PER_PAIR`` for each pair of free objects, because they may meet. The sum of the last two is at most
-``MOST_PER_OBJECT`` for each free object."""
-LEAST = 20_000.0
-"""Smallest number of units beyond ``PER_SCENE``, unless ``MOST_PER_OBJECT`` gives fewer. It lets a scene of five
+``MAX_PER_OBJECT`` for each free object."""
+MIN_UNITS = 20_000.0
+"""Smallest number of units beyond ``PER_SCENE``, unless ``MAX_PER_OBJECT`` gives fewer. It lets a scene of five
 objects go through all rounds of :func:`~scene_envs.physics.make_ready`."""
 _CROWDED = 0.75
 """Above this share of free objects that do not stand clear of each other, a scene gets only ``PER_SCENE`` units."""
@@ -28,16 +28,12 @@ _DEEP = 1e-2
 class Budget:
     """Units of work that a search or a simulation may spend.
 
-    A unit of a search is one pair of convex parts looked at. A unit of simulation is one free object over one step of
+    A unit of a search is one tested pair of convex parts. A unit of simulation is one free object over one step of
     35 solver iterations: about 0.05 ms, several times that where objects are deep in each other.
-
-    Attributes:
-        limit: units until the work ends.
-        spent: units spent so far.
     """
 
-    limit: float
-    spent: float = 0.0
+    limit: float  # number of units at which the work ends
+    spent: float = 0.0  # number of units spent so far
 
     def spend(self, units: float) -> None:
         """Add ``units`` of work."""
@@ -50,12 +46,7 @@ class Budget:
 
 
 def simulation_units(objects: Objects, pairs: ObjectPairs) -> float:
-    """Units of simulation that one scene may take.
-
-    Args:
-        objects: of one scene.
-        pairs: their near pairs.
-    """
+    """Units of simulation that one scene, given as its objects and their near pairs, may take."""
     first, second = pairs.first, pairs.second
     low = np.maximum(pairs.low[first], pairs.low[second])
     high = np.minimum(pairs.high[first], pairs.high[second])
@@ -68,4 +59,4 @@ def simulation_units(objects: Objects, pairs: ObjectPairs) -> float:
     if crowded.sum() > _CROWDED * free:
         return PER_SCENE
     more = PER_OBJECT * free + PER_PAIR * free * (free - 1) / 2
-    return PER_SCENE + min(max(more, LEAST), MOST_PER_OBJECT * free)
+    return PER_SCENE + min(max(more, MIN_UNITS), MAX_PER_OBJECT * free)

@@ -15,7 +15,7 @@ from scene_envs.physics.placement import Objects, PlacedObjects, object_boxes, p
 from scene_envs.physics.separation import separations
 
 TOUCHING = 2e-5
-"""Overlap (m) below which the face-plane bound is taken as the depth, without looking for the exact one."""
+"""Overlap (m) below which the face-plane bound is taken as the depth, and no exact depth is computed."""
 NEAR = 3e-3
 """Object pairs are listed when their boxes are at most this far apart (m)."""
 NEAR_FIXED = 0.06
@@ -25,22 +25,16 @@ _TOO_MANY = 20_000_000
 
 
 class Collider:
-    """Finds near and overlapping objects; geometry is built once, poses come per call.
-
-    Args:
-        library: geometry of the assets.
-    """
+    """Search for near and overlapping objects; geometry is built once, poses are arguments."""
 
     def __init__(self, library: LibraryGeometry) -> None:
         self.library = library
         self.depth = PenetrationDepth([part.vertices for part in library.parts])
 
     def pairs(self, objects: Objects, *, totals: bool = False) -> ObjectPairs:
-        """Near pairs of objects within each scene; two fixed objects are never a pair.
+        """Near pairs of objects within each of one or more scenes; two fixed objects are never a pair.
 
-        Args:
-            objects: the objects of one or more scenes.
-            totals: also sum over all part pairs, the literature's per-geometry measure.
+        With ``totals`` the depths of all part pairs are summed as well, the literature's per-geometry measure.
         """
         coarse = place(self.library, objects, "coarse")
         low, high = object_boxes(coarse)
@@ -61,13 +55,7 @@ class Collider:
         return ObjectPairs(first, second, gap, direction, depth, total, part_count, low, high, contacts, rough)
 
     def contacts(self, objects: Objects, pairs: ObjectPairs, fine: Mask) -> Contacts:
-        """Near parts: the fine ones of some object pairs, the coarse ones of the others.
-
-        Args:
-            objects: the objects.
-            pairs: what :meth:`pairs` found for these objects.
-            fine: (P,) bool, the pairs whose fine parts are taken.
-        """
+        """Near parts of the ``pairs`` of objects: fine parts for the pairs in ``fine`` (P,), coarse ones for others."""
         if not fine.any():
             return pairs.contacts
         count = len(objects)
@@ -114,7 +102,7 @@ class Collider:
         part_count: Index,
         totals: bool,
     ) -> None:
-        # Objects that barely touch: the bound from the face planes of the enclosing coarse parts is taken as the depth.
+        # The depth of objects that barely touch is the bound from the face planes of the enclosing coarse parts.
         # Sums over part pairs need the fine parts, unless each of the two objects has only one.
         single = np.array([len(asset.fine.parts) == 1 for asset in self.library.assets])
         simple = gap > -TOUCHING
@@ -161,7 +149,7 @@ def _rounds(target: Index, bound: Array, depth: Array, every: bool) -> Iterator[
         target: (Q,) object pair of each candidate, those of one pair together.
         bound: (Q,) m, upper bound of each candidate's depth; descending within a pair.
         depth: (P,) m, depths found so far; the caller updates them between rounds.
-        every: give all candidates at once.
+        every: Whether to give all candidates at once.
     """
     rows = np.arange(len(target))
     if every:

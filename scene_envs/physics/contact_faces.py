@@ -19,23 +19,14 @@ _SAME_AREA = 1e-3
 
 @dataclass(frozen=True)
 class ContactFace:
-    """A horizontal face of an asset: where it is, and how far its solid area reaches.
+    """Position of a horizontal face of an asset, and extent of its solid area."""
 
-    Attributes:
-        height: z in the asset frame, m.
-        center: (x, y) in the asset frame, m.
-        inner: radius (m) of the largest circle inside the outline.
-        corners: smallest distance (m) of an outline corner from the centre.
-        outer: largest distance (m) of an outline corner from the centre.
-        hole: radius (m) outside of which the face is solid up to its outline; 0 without a hole.
-    """
-
-    height: float
-    center: tuple[float, float]
-    inner: float
-    corners: float
-    outer: float
-    hole: float
+    height: float  # height z in the asset frame, m
+    center: tuple[float, float]  # centre (x, y) in the asset frame, m
+    inner: float  # radius (m) of the largest circle inside the outline
+    corners: float  # smallest distance (m) of an outline corner from the centre
+    outer: float  # largest distance (m) of an outline corner from the centre
+    hole: float  # radius (m) outside of which the face is solid up to its outline; 0 without a hole
 
 
 def contact_face(fine: Sequence[PartGeometry], coarse: Sequence[PartGeometry], side: int) -> ContactFace | None:
@@ -89,7 +80,7 @@ def _area(polygon: Array) -> float:
 
 
 def _outside(points: Array, polygon: Array) -> Array:
-    """(P,): how far (m) each point lies outside the convex polygon; negative inside."""
+    """(P,) m, distance of each point outside the convex polygon; negative inside."""
     edge = np.roll(polygon, -1, axis=0) - polygon
     normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     return ((points[:, None] - polygon[None]) * normal[None]).sum(axis=2).max(axis=1)

@@ -1,4 +1,4 @@
-"""Corrections of scenes while they are denoised: objects come apart where they overlap, and down where they float."""
+"""Corrections of scenes during denoising: overlapping objects move apart, floating objects move down."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from scene_envs.physics.projection import Corners, separated
 from scene_envs.scene import SceneBatch
 
 _DEEP = 5e-4
-"""Overlap (m) up to which two objects are left as they are; feasible objects may overlap by 1e-3 m."""
+"""Overlap (m) up to which two objects are not moved; feasible objects may overlap by 1e-3 m."""
 _FLOATING = 3e-4
 """Height (m) up to which an object counts as standing."""
 _FALL = 0.03
-"""An object higher than this (m) above everything is left as it is."""
-_LEAST = 0.02
-"""Least standard deviation along an axis, as a share of the largest one."""
+"""An object higher than this (m) above all others is not moved down."""
+_MIN_SPREAD = 0.02
+"""Smallest standard deviation along an axis, as a share of the largest one."""
 _LEVEL = np.array([1.0, 1.0, 50.0])
-"""Cost of a metre along each axis where furniture moves: it stays at its height."""
+"""Cost of moving furniture by a metre along each axis: vertical moves are avoided."""
 _CHUNK = 16
 """Scenes whose overlaps are found together."""
 
 
 def corrections(batch: SceneBatch, spread: Array, movable: Mask | None = None) -> Tensor:
-    """Moves (B, N, 3), m, after which objects overlap and float less: one round for each scene.
+    """Moves (B, N, 3), m, that reduce overlap and floating: one round for each scene.
 
-    First, generated furniture that overlaps other furniture comes apart along the floor, and takes along what is on it.
-    Then overlapping objects come apart by a least-distance problem, as in :func:`~scene_envs.physics.project`.
+    First, overlapping pieces of generated furniture move apart along the floor, together with the objects on them.
+    Then overlapping objects move apart by a least-distance problem, as in :func:`~scene_envs.physics.project`.
     Distances are measured in standard deviations of the positions, so objects move along the axes on which they are
-    uncertain rather than along the others. At last each object comes straight down onto what is less than 3 cm below
-    it. Rotations and the fixed objects of the scene type stay.
+    uncertain. Last, each object moves straight down onto the object less than 3 cm below it. Rotations and the fixed
+    objects of the scene type stay.
 
     Args:
         batch: B scenes of N slots, on the CPU, with finite poses.
-        spread: (3,) standard deviation of the positions along the axes of the world; only its ratios matter.
+        spread: (3,) standard deviations of the positions along the axes of the world; only their ratios matter.
         movable: (B, N) bool, slots whose objects may move; None for all.
 
     >>> corrections(SceneBatch.empty("dimsum_table", 1), np.ones(3)).abs().max()
@@ -48,7 +48,7 @@ def corrections(batch: SceneBatch, spread: Array, movable: Mask | None = None) -
     """
     physics, moves = physics_of(batch.scene_type), np.zeros((*batch.tensor.shape[:2], 3))
     movable = np.ones(batch.tensor.shape[:2], dtype=bool) if movable is None else movable
-    cost = 1.0 / np.maximum(spread / max(float(spread.max()), 1e-12), _LEAST)
+    cost = 1.0 / np.maximum(spread / max(float(spread.max()), 1e-12), _MIN_SPREAD)
     workspace = batch.scene_type.workspace
     for start in range(0, len(batch), _CHUNK):
         some, free = batch[start : start + _CHUNK], movable[start : start + _CHUNK]
@@ -85,7 +85,7 @@ def _apart(physics: Physics, objects: Objects, workspace: Corners, cost: Array) 
 
 
 def _furniture_apart(physics: Physics, objects: Objects, welded: Mask, movable: Mask, workspace: Corners) -> Objects:
-    """The objects (n,) after the ``welded`` ones that are ``movable`` came apart, with what is on each of them."""
+    """The objects (n,) after overlapping ``welded`` and ``movable`` ones moved apart, with the objects on them."""
     pieces = np.flatnonzero(welded)
     furniture = replace(objects[pieces], fixed=~movable[pieces])
     moves = _apart(physics, furniture, workspace, _LEVEL) - furniture.translation

@@ -1,4 +1,4 @@
-"""Falls: how far objects can come straight down before they meet what is below them."""
+"""Distances that objects fall straight down until they meet another object."""
 
 from __future__ import annotations
 
@@ -9,22 +9,18 @@ from scene_envs.physics.collision import Collider, scene_pairs
 from scene_envs.physics.placement import Objects, object_boxes, part_pairs, place
 from scene_envs.physics.separation import grouped_gaps
 
-_BESIDE = 5e-4
-"""Overlap (m) with a wall beside an object that does not hold it up."""
+_WALL_OVERLAP = 5e-4
+"""Overlap (m) with a wall next to an object at which the wall does not support the object."""
 _WALL = 1e-2
 """Vertical component of a face normal up to which the face counts as a wall."""
 
 
 def falls(collider: Collider, objects: Objects, limit: float) -> Array:
-    """(n,) m, how far each free object falls until it meets another one; 0 where that is further than ``limit``.
+    """(n,) m, distance that each free object falls until it meets another one; 0 where it exceeds ``limit``.
 
-    Objects fall straight down, without turning, the lowest ones first, so that an object also follows what it stands
-    on. The distance follows from the face planes of the fine parts, and is at most the true one.
-
-    Args:
-        collider: geometry of the assets.
-        objects: of one or more scenes; fixed ones do not fall.
-        limit: m.
+    Objects (n,) of one or more scenes fall straight down, without turning, the lowest ones first, so that an object
+    follows its support. Fixed objects do not fall. The distance follows from the face planes of the fine parts, and is
+    at most the true one.
     """
     low, high = object_boxes(place(collider.library, objects, "coarse"))
     upper, lower = _over(objects, low, high, limit)
@@ -41,7 +37,7 @@ def falls(collider: Collider, objects: Objects, limit: float) -> Array:
 
 
 def _over(objects: Objects, low: Array, high: Array, limit: float) -> tuple[Index, Index]:
-    """Pairs (P,), (P,) of a free object and one that its box may come down on."""
+    """Pairs (P,), (P,) of a free object and one that its box may fall on."""
     first, second = scene_pairs(objects)
     upper, lower = np.concatenate([first, second]), np.concatenate([second, first])
     meets: Mask = ~objects.fixed[upper] & (low[lower, 2] < low[upper, 2]) & (low[upper, 2] < high[lower, 2] + limit)
@@ -62,12 +58,12 @@ def _rooms(collider: Collider, objects: Objects, upper: Index, lower: Index, lim
     pair, a, b = pair[near], a[near], b[near]
     offset = objects.translation[upper] - objects.translation[lower]
     for rows, gaps, normals in grouped_gaps(collider.library, placed.parts, a, b, offset[pair]):
-        speed = -normals[..., 2]  # of a gap, per metre of fall
+        speed = -normals[..., 2]  # change of a gap per metre of fall
         with np.errstate(divide="ignore", invalid="ignore"):
             when = -gaps / speed
-        beside = ((np.abs(speed) < _WALL) & (gaps >= -_BESIDE)).any(axis=1)
+        at_wall = ((np.abs(speed) < _WALL) & (gaps >= -_WALL_OVERLAP)).any(axis=1)
         enter = np.where(speed < -_WALL, when, -np.inf).max(axis=1)
         leave = np.where(speed > _WALL, when, np.inf).min(axis=1)
-        meets = ~beside & (enter < leave) & (leave > 0)
+        meets = ~at_wall & (enter < leave) & (leave > 0)
         np.minimum.at(room, pair[rows[meets]], np.maximum(enter[meets], 0.0))
     return room

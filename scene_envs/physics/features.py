@@ -26,24 +26,15 @@ class PartFeatures:
 
     A part without thickness has two opposite faces, whose edges are those of the polygon; a line is a polygon of two
     equal edges, and a point has no edges.
-
-    Attributes:
-        corners: (V, 3) m, those of the hull.
-        normals: (K, 3) unit outward normals of its distinct faces.
-        offsets: (K,) m; the part is where ``normals @ x <= offsets``.
-        edge_point: (E, 3) m, one end of every edge between two distinct faces.
-        edge_direction: (E, 3) unit vectors along the edges.
-        edge_faces: (E, 2) the two faces of an edge.
-        edge_outward: (E, 3) unit vectors halfway between the normals of the two faces.
     """
 
-    corners: Array
-    normals: Array
-    offsets: Array
-    edge_point: Array
-    edge_direction: Array
-    edge_faces: Index
-    edge_outward: Array
+    corners: Array  # (V, 3) corners of the hull, m
+    normals: Array  # (K, 3) unit outward normals of its distinct faces
+    offsets: Array  # (K,) m; the part is where ``normals @ x <= offsets``
+    edge_point: Array  # (E, 3) one end of every edge between two distinct faces, m
+    edge_direction: Array  # (E, 3) unit vectors along the edges
+    edge_faces: Index  # (E, 2) the two faces of an edge
+    edge_outward: Array  # (E, 3) unit vectors halfway between the normals of the two faces
 
     @classmethod
     def of(cls, vertices: Array) -> PartFeatures:

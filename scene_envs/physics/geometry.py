@@ -20,38 +20,23 @@ _CONTAINED = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class LevelGeometry:
-    """All parts of one asset at one level of detail.
+    """All parts of one asset at one level of detail."""
 
-    Attributes:
-        parts: the convex parts.
-        ids: (P,) index of each part in the library.
-        vertices: (sum V, 3) corners of all parts, m.
-        starts: (P,) where each part begins in ``vertices``.
-    """
-
-    parts: tuple[PartGeometry, ...]
-    ids: Index
-    vertices: Array
-    starts: Index
+    parts: tuple[PartGeometry, ...]  # convex parts
+    ids: Index  # (P,) index of each part in the library
+    vertices: Array  # (sum V, 3) corners of all parts, m
+    starts: Index  # (P,) first row of each part in ``vertices``
 
 
 @dataclass(frozen=True, eq=False)
 class AssetGeometry:
-    """One asset: its two levels of detail, and the flat faces it can stand on or carry others with.
+    """One asset: its two levels of detail, and the flat faces it can stand on or carry others with."""
 
-    Attributes:
-        asset: the asset.
-        fine: parts that are hollow where the asset is hollow.
-        coarse: fewer parts that enclose ``fine``; the same object as ``fine`` where there are none.
-        bottom: the flat face at the lowest z of the asset frame, or None.
-        top: the flat face at the highest z, or None.
-    """
-
-    asset: Asset
-    fine: LevelGeometry
-    coarse: LevelGeometry
-    bottom: ContactFace | None
-    top: ContactFace | None
+    asset: Asset  # asset with this geometry
+    fine: LevelGeometry  # parts that are hollow where the asset is hollow
+    coarse: LevelGeometry  # fewer parts that enclose ``fine``; the same object as ``fine`` where there are none
+    bottom: ContactFace | None  # flat face at the lowest z of the asset frame, or None
+    top: ContactFace | None  # flat face at the highest z, or None
 
     @property
     def is_hollow(self) -> bool:
@@ -61,25 +46,15 @@ class AssetGeometry:
 
 @dataclass(frozen=True, eq=False)
 class PartTable:
-    """Parts of one size class, padded with copies of their first corner and direction.
+    """Parts of one size class, padded with copies of their first corner and direction."""
 
-    Attributes:
-        vertices: (P, V, 3) m.
-        normals: (P, K, 3).
-        offsets: (P, K) m.
-    """
-
-    vertices: Array
-    normals: Array
-    offsets: Array
+    vertices: Array  # (P, V, 3) m
+    normals: Array  # (P, K, 3)
+    offsets: Array  # (P, K) m
 
 
 class LibraryGeometry:
-    """Collision geometry of several assets; category ``c`` is ``assets[c]``.
-
-    Args:
-        assets: the assets of a scene type, in category order.
-    """
+    """Collision geometry of several assets; category ``c`` is ``assets[c]``."""
 
     def __init__(self, assets: Sequence[Asset]) -> None:
         self.parts: list[PartGeometry] = []

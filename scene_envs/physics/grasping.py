@@ -28,7 +28,7 @@ TURNS = tuple(np.arange(4) * np.pi / 4)
 PLACES = (0.5, 0.0, 1.0)
 """Grasp positions as fractions of the object's extent in the closing direction: its middle, then its two edges."""
 PART_PAIRS = 35_000.0
-"""Limit of pairs of convex parts tested per scene: six times what a crowded scene takes, about 0.6 s."""
+"""Limit of pairs of convex parts tested per scene: six times the number of a crowded scene, about 0.6 s."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class Gripper:
     """A parallel gripper of boxes; the defaults are about those of a Franka hand. All lengths in m.
 
     Attributes:
-        opening: distance between the open fingers.
-        finger_length: along the approach.
-        finger_width: across the approach and the closing direction.
-        finger_thickness: along the closing direction.
-        palm: size (along the closing direction, across) of the body above the fingers.
-        path: how far back along the approach the palm must have room.
-        reaches: depths of the fingertips below the near side of the object, in the order in which they are tried; the
+        opening: Distance between the open fingers.
+        finger_length: Size of a finger along the approach.
+        finger_width: Size of a finger across the approach and the closing direction.
+        finger_thickness: Size of a finger along the closing direction.
+        palm: Size (along the closing direction, across it) of the body above the fingers.
+        path: Length of the free space that the palm needs behind it along the approach.
+        reaches: Depths of the fingertips below the near side of the object, in the order in which they are tried; the
             fingertips go no deeper than its far side.
 
     Raises:
@@ -104,8 +104,8 @@ def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper:
 
     Args:
         batch: B scenes of N slots.
-        approaches: A directions in the world from the objects to where the gripper comes from, such as (0, 0, 1).
-        gripper: its sizes; the default ones when None.
+        approaches: A directions in the world from the objects to the gripper before the approach, such as (0, 0, 1).
+        gripper: Sizes of the gripper; None takes the default ones.
     """
     gripper = Gripper() if gripper is None else gripper
     found = torch.zeros(len(approaches), *batch.tensor.shape[:2], dtype=torch.bool)
@@ -129,7 +129,7 @@ def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper:
 
 
 class _Hand:
-    """A gripper with the assets of a library: the last asset but one is the gripper, the last its space for a grasp."""
+    """A gripper with the assets of a library; the last two assets are the gripper and its space for a grasp."""
 
     def __init__(self, library: AssetLibrary, gripper: Gripper) -> None:
         self.gripper = gripper
@@ -162,7 +162,7 @@ class _Hand:
         return np.setdiff1d(free, open_rows)
 
     def _extents(self, objects: Objects, rows: Index, back: Array) -> tuple[Index, Array, Array, Array]:
-        """Gripper frames for some objects, and how far these extend along them.
+        """Gripper frames for some objects, and the extents of the objects along the axes of these frames.
 
         Returns:
             owner (G,), rotation (G, 3, 3) gripper to world, lowest and highest coordinate (G, 3), (G, 3) m along the
@@ -178,7 +178,7 @@ class _Hand:
         return owner, rotation.reshape(-1, 3, 3), low.reshape(-1, 3), high.reshape(-1, 3)
 
     def _succeed(self, objects: Objects, owner: Index, rotation: Array, translation: Array, budget: Budget) -> Index:
-        """Those of G poses at which part of the object is between the fingers and the gripper overlaps nothing."""
+        """Rows of the G poses at which part of the object is between the fingers and the gripper overlaps nothing."""
         left = np.arange(len(owner))
         for tool, wanted in ((self.grasp, True), (self.body, False)):
             both = _concatenate(objects, tool, rotation[left], translation[left])

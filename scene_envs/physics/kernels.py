@@ -27,21 +27,13 @@ _FALLEN = 1.0
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some scenes of one type, as workers receive them.
+    """Some scenes of one type, as workers receive them."""
 
-    Attributes:
-        scene_type: the scene type itself, so that types registered elsewhere work in workers.
-        translations: (b, N, 3) float64 m.
-        rotations: (b, N, 3, 3) float64.
-        categories: (b, N) int64.
-        units: (b,) units of simulation that each scene may spend; None derives them from its objects.
-    """
-
-    scene_type: SceneType
-    translations: Array
-    rotations: Array
-    categories: Index
-    units: Array | None = None
+    scene_type: SceneType  # an object, no name: types that a worker has not registered work too
+    translations: Array  # (b, N, 3) float64 m
+    rotations: Array  # (b, N, 3, 3) float64
+    categories: Index  # (b, N) int64
+    units: Array | None = None  # (b,) units of simulation that each scene may spend; None derives them from its objects
 
     def __len__(self) -> int:
         return len(self.categories)
@@ -60,9 +52,7 @@ def _is_heap(physics: Physics, objects: Objects) -> bool:
     """Whether objects of one scene overlap too much to be simulated in bounded time."""
     if not heaps(physics.collider, objects).any():
         return False
-    _LOGGER.warning(
-        "objects of a scene are too deep in each other to be simulated; project it first; its row is invalid"
-    )
+    _LOGGER.warning("objects of a scene overlap too deeply to be simulated; project it first; its row is invalid")
     return True
 
 

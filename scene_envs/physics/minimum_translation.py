@@ -2,7 +2,7 @@
 
 A convex part that moves along a straight line overlaps another convex part during one interval, which follows from the
 face planes of both. A translation frees an object pair when it lies outside the intervals of all pairs of their parts:
-beside the other object, above it, or in its hollow.
+next to the other object, above it, or in its hollow.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scene_envs.physics.planes import CLEARANCE
 from scene_envs.physics.separation import grouped_gaps
 
 _AROUND = 0.06
-"""Parts further apart than this (m) are not looked at when a translation is measured."""
+"""Parts further apart than this (m) are ignored when a translation is measured."""
 _OWN = 4
 """Face directions tried per object pair from its deepest parts, and from its shallowest, besides the common ones."""
 _STEPS = 6
@@ -51,14 +51,13 @@ def minimum_translations(
     """(P, 3) m: translations that free overlapping object pairs when they are added to the offsets of the pairs.
 
     Args:
-        collider: geometry of the assets.
-        objects: of one scene.
-        first: (P,) object rows.
-        second: (P,) object rows.
-        bounds: lowest and highest translations (n, 3), (n, 3) m.
-        tried: directions that did not help; the directions of the returned translations are added to them.
-        budget: charged with one unit per pair of parts.
-        cost: (3,) of a metre along each axis of the world; None for 1.
+        collider: Geometry of the assets.
+        objects: Objects of one scene.
+        first, second: (P,) object rows.
+        bounds: Lowest and highest translations (n, 3), (n, 3) m.
+        tried: Directions that did not help; the directions of the returned translations are added to them.
+        budget: Work budget, charged with one unit per pair of parts.
+        cost: (3,) cost of a metre along each axis of the world; None for 1.
     """
     placed = place(collider.library, objects, "fine")
     pair, a, b = part_pairs(placed, first, second)
@@ -125,7 +124,7 @@ def _walk(
     groups: list[tuple[Index, Array, Array]],
     bounds: tuple[Array, Array],
 ) -> Array:
-    """(P, 3) m: sum of several steps, each out of the part that is deepest by then; leads out of corners.
+    """(P, 3) m: sum of several steps, each out of the part that is then the deepest; leads out of corners.
 
     From fixed objects, steps down and steps out of the workspace are avoided.
     """
@@ -161,7 +160,7 @@ def _walk(
 
 
 def _lengths(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], directions: Array) -> Array:
-    """(P, D) m: how far to go in each direction until no parts overlap."""
+    """(P, D) m: length of the move in each direction until no parts overlap."""
     enter = np.full((len(pair), directions.shape[1]), np.inf)
     leave = np.full_like(enter, -np.inf)
     for rows, gaps, normals in groups:

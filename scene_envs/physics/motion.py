@@ -29,7 +29,7 @@ _TALL = 3
 _HIGH = 7
 """Number of carrying objects from which stacks are simulated with the finest steps at once."""
 _DOUBT = 6e-4, 3e-3
-"""Range of motion (m) of an object high in a stack that is integrated again, finer, before it is believed."""
+"""Range of motion (m) of an object high in a stack that is simulated again with finer steps."""
 ITERATIONS, CONVERGED = 35, 150
 """Solver iterations per step: the usual number, and the number after which contacts neither creep nor give way."""
 FINEST = SolverSettings(1.0 / 960.0, ITERATIONS)
@@ -38,16 +38,11 @@ _LONG, _CREEP = 1.0, 1e-2
 """In simulations longer than ``_LONG`` (s), motion below ``_CREEP`` (m) may be creep of the solver. It is simulated
 again with ``CONVERGED`` iterations."""
 _DAMPING = 0.3
-"""Fraction of velocity that objects lose per second while they settle. Coarser steps are no gain here: with 1/240 s
-jittered Dimsum scenes took 1.4 times as long to come to rest, and 1.5 % of objects were not ready afterwards."""
+"""Fraction of velocity that objects lose per second while they settle."""
 
 
 class Physics:
-    """Collision geometry, tests of support and rest, and simulator of one asset library, kept by this process.
-
-    Args:
-        library: geometry of the assets.
-    """
+    """Collision geometry, tests of support and rest, and simulator of one asset library, kept by this process."""
 
     def __init__(self, library: LibraryGeometry) -> None:
         self.library = library
@@ -79,17 +74,11 @@ def physics_of(scene_type: SceneType) -> Physics:
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """Objects of one scene after some time.
+    """Objects of one scene after some time."""
 
-    Attributes:
-        rotation: (n, 3, 3).
-        translation: (n, 3) m.
-        angle: (n,) rad, how far each turned.
-    """
-
-    rotation: Array
-    translation: Array
-    angle: Array
+    rotation: Array  # (n, 3, 3)
+    translation: Array  # (n, 3) m
+    angle: Array  # (n,) rad, angle that each object turned
 
     @property
     def is_finite(self) -> bool:
@@ -108,12 +97,12 @@ def motion(
     """Displacement of the objects of several scenes in ``duration`` seconds.
 
     Args:
-        physics: of the scenes' assets.
-        objects: the objects.
-        pairs: their near pairs.
-        duration: s.
-        budgets: units of simulation that each scene may spend.
-        tilt: (x, y) rad by which gravity is tilted in simulations.
+        physics: Physics of the scenes' assets.
+        objects: Objects of the scenes.
+        pairs: Near pairs of the objects.
+        duration: Simulated time, s.
+        budgets: Units of simulation that each scene may spend.
+        tilt: (x, y) angles by which gravity is tilted in simulations, rad.
 
     Returns:
         displacement (n,) m, rotation (n,) rad, and the scenes whose simulation diverged or was too much work.
@@ -152,15 +141,15 @@ def advance(
     are simulated again together.
 
     Args:
-        physics: of the scene's assets.
-        objects: of one scene.
-        pairs: their near pairs.
-        rest: which of the objects have a closed form, and their motion.
-        duration: s.
-        budget: units of simulation; when they are spent, objects stay where they have got to.
-        settling: solver iterations per step of a damped motion. None simulates undamped, and doubtful motion again with
+        physics: Physics of the scene's assets.
+        objects: Objects of one scene.
+        pairs: Near pairs of the objects.
+        rest: Objects with a closed form, and their motion.
+        duration: Simulated time, s.
+        budget: Units of simulation; when they are spent, objects stay at the poses reached.
+        settling: Solver iterations per step of a damped motion. None simulates undamped, and doubtful motion again with
             other settings.
-        tilt: (x, y) rad by which gravity is tilted in simulations.
+        tilt: (x, y) angles by which gravity is tilted in simulations, rad.
     """
     translation = objects.translation.copy()
     translation[:, 2] += rest.rise
@@ -194,7 +183,7 @@ def _simulate(
     settling: int | None,
     tilt: tuple[float, float],
 ) -> Mask:
-    """Simulate the objects ``due`` (n,), write their new poses into ``moved``, and return which left early (n,)."""
+    """Simulate the objects ``due`` (n,), write their poses into ``moved``, and return those that left early (n,)."""
     left = np.zeros(len(objects), dtype=bool)
     rows = np.flatnonzero(due | objects.fixed)
     among, near = objects[rows], pairs.among(rows)
@@ -257,22 +246,18 @@ def _meetings(
 
 
 def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, second: Index) -> Mask:
-    """Join the clusters of objects that met, in ``group`` in place; returns which objects to simulate again (n,)."""
+    """Join the clusters of objects that met, in ``group`` in place; returns the objects to simulate again (n,)."""
     count = len(objects)
     touched = np.zeros(count, dtype=bool)
     touched[first] = touched[second] = True
     touched |= np.isin(group, group[touched & (group >= 0)])
     due = company(objects, pairs, touched)
     due |= np.isin(group, group[due & (group >= 0)])
-    # One cluster for all of them: they are few, and objects that were at rest are at rest again.
+    # one cluster for all of these few objects; those that were at rest are at rest again
     group[due] = int(group.max()) + 1
     return due
 
 
 def settings_for(height: int) -> SolverSettings:
-    """Solver settings of a stack: a taller stack gets finer steps, so that it stands as still as in reality.
-
-    Args:
-        height: how many objects carry the topmost one.
-    """
+    """Solver settings of a stack whose topmost object stands on ``height`` others: taller stacks get finer steps."""
     return FINEST if height >= _HIGH else SolverSettings(1.0 / 480.0, ITERATIONS)

@@ -2,7 +2,7 @@
 
 The depth of two convex parts is the least distance from the origin to a face of their Minkowski difference. Its faces
 come from the faces of either part and from pairs of edges whose arcs cross on the sphere of directions (see
-:mod:`scene_envs.physics.features`; the normals of the second part are negated). All faces are looked at, so that the
+:mod:`scene_envs.physics.features`; the normals of the second part are negated). All faces are tested, so that the
 result is exact for any pair: coincident, nested or touching parts are no special cases.
 
 When a depth ``d`` is already found, an edge can give a smaller one only if no corner of the other part lies ``d`` deep
@@ -33,7 +33,7 @@ class PenetrationDepth:
     """Penetration depth of pairs of convex parts at any poses.
 
     Args:
-        parts: corners (V, 3) of each part in its own frame, m; points inside the hull are ignored.
+        parts: Corners (V, 3) of each part in its own frame, m; points inside the hull are ignored.
     """
 
     def __init__(self, parts: Sequence[Array]) -> None:
@@ -60,17 +60,12 @@ class PenetrationDepth:
             self._tables[int(index)] = np.stack(padded).transpose(2, 0, 1).copy()
 
     def __call__(self, placed: PlacedParts, first: Index, second: Index) -> tuple[Array, Array]:
-        """Depth of each pair of placed parts.
-
-        Args:
-            placed: the parts and their poses.
-            first: (P,) rows of ``placed``.
-            second: (P,) rows of ``placed``.
+        """Depth of each pair of placed parts, given as two arrays (P,) of rows of ``placed``.
 
         Returns:
-            depth (P,) m, how far the second part has to move, along ``direction``, until the two only touch; and that
-            direction (P, 3), a unit vector in the world. Where the parts are apart, minus the depth is the gap between
-            them along ``direction``, at most their distance. NaN where a pose has a NaN.
+            depth (P,) m, the distance that the second part has to move, along ``direction``, until the two only touch;
+            and that direction (P, 3), a unit vector in the world. Where the parts are apart, minus the depth is the gap
+            between them along ``direction``, at most their distance. NaN where a pose has a NaN.
         """
         depth, direction = np.empty(len(first)), np.empty((len(first), 3))
         a, b = placed.part[first], placed.part[second]
@@ -154,7 +149,7 @@ class PenetrationDepth:
 
 
 class _Ragged:
-    """Vectors of all parts in one array ``vectors`` (3, ..., n), with ``start`` and ``count`` of each part's."""
+    """Vectors of all parts in one array ``vectors`` (3, ..., n), with ``start`` and ``count`` per part."""
 
     def __init__(self, vectors: list[Array]) -> None:
         self.vectors = np.concatenate(vectors).T.copy()
@@ -166,10 +161,10 @@ class _Halves:
     """Pairs seen from both sides: half ``2 p`` belongs to the first part of pair ``p``, half ``2 p + 1`` to the second.
 
     Attributes:
-        owner: (2 P,) part whose features are looked at.
+        owner: (2 P,) part whose features are tested.
         other: (2 P,) the other part.
-        turn: (3, 3, 2 P), from the owner's frame to the other's.
-        move: (3, 2 P) m, the owner's origin in the other's frame.
+        turn: (3, 3, 2 P) rotation from the owner's frame to the other's.
+        move: (3, 2 P) origin of the owner in the other's frame, m.
     """
 
     def __init__(self, placed: PlacedParts, first: Index, second: Index) -> None:
@@ -184,7 +179,7 @@ class _Halves:
 
 
 class _Faces:
-    """The faces of the owners of half pairs, and the corner of the other part that is deepest under each.
+    """The faces of the owners of half pairs, and the deepest corner of the other part under each face.
 
     Attributes:
         start: (2 P,) first face of each half pair.

@@ -12,23 +12,14 @@ from scene_envs.physics.rows import Rows
 
 @dataclass(frozen=True, eq=False)
 class Contacts(Rows):
-    """Near pairs of parts.
+    """Near pairs of parts."""
 
-    Attributes:
-        first: (Q,) object rows.
-        second: (Q,) object rows, larger than ``first``.
-        part_first: (Q,) part of the first object in the library.
-        part_second: (Q,) part of the second.
-        gap: (Q,) m along ``direction``; the true distance is at least this much.
-        direction: (Q, 3) unit vector in the world, from the first part to the second.
-    """
-
-    first: Index
-    second: Index
-    part_first: Index
-    part_second: Index
-    gap: Array
-    direction: Array
+    first: Index  # (Q,) object rows
+    second: Index  # (Q,) object rows, larger than ``first``
+    part_first: Index  # (Q,) part of the first object in the library
+    part_second: Index  # (Q,) part of the second object in the library
+    gap: Array  # (Q,) m along ``direction``; the true distance is at least this much
+    direction: Array  # (Q, 3) unit vector in the world, from the first part to the second
 
     def among(self, number: Index) -> Contacts:
         """The contacts of objects whose new ``number`` (n,) is not negative, renumbered."""
@@ -38,34 +29,19 @@ class Contacts(Rows):
 
 @dataclass(frozen=True, eq=False)
 class ObjectPairs:
-    """Pairs of objects whose boxes are near each other.
+    """Pairs of objects whose boxes are near each other."""
 
-    Attributes:
-        first: (P,) row of the object.
-        second: (P,) row of the other object, larger than ``first``.
-        gap: (P,) m, signed gap of the coarse parts along ``direction``.
-        direction: (P, 3) unit vector in the world, from the first object to the second.
-        depth: (P,) m, how deep the fine parts overlap; 0 when they do not.
-        total: (P,) m, the sum of the depths of all overlapping fine parts (only when asked for).
-        part_count: (P,) overlapping fine part pairs (only when asked for).
-        low: (n, 3) lowest corner of each object's box, m.
-        high: (n, 3) highest corner of each object's box, m.
-        contacts: near pairs of their coarse parts.
-        rough: (P,) bool, True where the depth is an upper bound, from face planes of the coarse parts, because exact
-            depths of the scene would take too long.
-    """
-
-    first: Index
-    second: Index
-    gap: Array
-    direction: Array
-    depth: Array
-    total: Array
-    part_count: Index
-    low: Array
-    high: Array
-    contacts: Contacts
-    rough: Mask
+    first: Index  # (P,) object rows
+    second: Index  # (P,) object rows, larger than ``first``
+    gap: Array  # (P,) m, signed gap of the coarse parts along ``direction``
+    direction: Array  # (P, 3) unit vector in the world, from the first object to the second
+    depth: Array  # (P,) m, overlap of the fine parts; 0 without overlap
+    total: Array  # (P,) m, sum of the depths of all overlapping fine parts (on request)
+    part_count: Index  # (P,) overlapping fine part pairs (on request)
+    low: Array  # (n, 3) lowest corner of each object's box, m
+    high: Array  # (n, 3) highest corner of each object's box, m
+    contacts: Contacts  # near pairs of the coarse parts of these objects
+    rough: Mask  # (P,) the depth is an upper bound, from coarse parts: exact depths would take too long
 
     def among(self, rows: Index) -> ObjectPairs:
         """The pairs of the objects ``rows`` (m,), ascending, renumbered to 0..m-1."""
@@ -73,19 +49,10 @@ class ObjectPairs:
         number[rows] = np.arange(len(rows))
         first, second = number[self.first], number[self.second]
         kept = (first >= 0) & (second >= 0)
-        return ObjectPairs(
-            first[kept],
-            second[kept],
-            self.gap[kept],
-            self.direction[kept],
-            self.depth[kept],
-            self.total[kept],
-            self.part_count[kept],
-            self.low[rows],
-            self.high[rows],
-            self.contacts.among(number),
-            self.rough[kept],
-        )
+        first, second, low, high = first[kept], second[kept], self.low[rows], self.high[rows]
+        gap, direction, depth, total = (column[kept] for column in (self.gap, self.direction, self.depth, self.total))
+        count, contacts, rough = self.part_count[kept], self.contacts.among(number), self.rough[kept]
+        return ObjectPairs(first, second, gap, direction, depth, total, count, low, high, contacts, rough)
 
     def deepest(self) -> Array:
         """(n,) m, the deepest overlap of each object."""

@@ -16,17 +16,11 @@ SIZE_CLASSES = ((8, 6), (16, 16), (32, 24))
 
 @dataclass(frozen=True, eq=False)
 class PartGeometry:
-    """A convex part with its face planes, asset frame.
+    """A convex part with its face planes, asset frame."""
 
-    Attributes:
-        vertices: (V, 3) m.
-        normals: (K, 3) distinct outward face normals.
-        offsets: (K,) m; the part is where ``normals @ x <= offsets``.
-    """
-
-    vertices: Array
-    normals: Array
-    offsets: Array
+    vertices: Array  # (V, 3) m
+    normals: Array  # (K, 3) distinct outward face normals
+    offsets: Array  # (K,) m; the part is where ``normals @ x <= offsets``
 
     @classmethod
     def of(cls, part: ConvexPart) -> PartGeometry:

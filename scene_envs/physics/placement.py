@@ -17,23 +17,14 @@ Level = Literal["fine", "coarse"]
 
 @dataclass(frozen=True, eq=False)
 class Objects(Rows):
-    """The non-empty slots of some scenes, flattened.
+    """The non-empty slots of some scenes, flattened."""
 
-    Attributes:
-        scene: (n,) scene of each object, ascending.
-        slot: (n,) slot of each object, ascending within a scene.
-        category: (n,) asset index.
-        rotation: (n, 3, 3).
-        translation: (n, 3) m.
-        fixed: (n,) bool, welded or static.
-    """
-
-    scene: Index
-    slot: Index
-    category: Index
-    rotation: Array
-    translation: Array
-    fixed: Mask
+    scene: Index  # (n,) scene of each object, ascending
+    slot: Index  # (n,) slot of each object, ascending within a scene
+    category: Index  # (n,) asset index
+    rotation: Array  # (n, 3, 3)
+    translation: Array  # (n, 3) m
+    fixed: Mask  # (n,) bool, welded or static
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -51,21 +42,13 @@ def flatten(
 
 @dataclass(frozen=True, eq=False)
 class PlacedObjects:
-    """Parts of objects at one level of detail, with their bounding boxes.
+    """Parts of objects at one level of detail, with their bounding boxes."""
 
-    Attributes:
-        parts: (I,) placed parts, those of one object together.
-        start: (n,) first part of each object.
-        count: (n,) number of parts of each object.
-        low: (I, 3) lowest corner of each part's box, m.
-        high: (I, 3) highest corner.
-    """
-
-    parts: PlacedParts
-    start: Index
-    count: Index
-    low: Array
-    high: Array
+    parts: PlacedParts  # (I,) placed parts, those of one object together
+    start: Index  # (n,) first part of each object
+    count: Index  # (n,) number of parts of each object
+    low: Array  # (I, 3) lowest corner of each part's box, m
+    high: Array  # (I, 3) highest corner of each part's box, m
 
 
 def place(library: LibraryGeometry, objects: Objects, level: Level) -> PlacedObjects:
@@ -101,7 +84,7 @@ def part_pairs(placed: PlacedObjects, first: Index, second: Index) -> tuple[Inde
     """All pairs of parts of the object pairs (``first``, ``second``), both (P,).
 
     Returns:
-        pair (Q,) which object pair, and the two parts (Q,), (Q,) as rows of ``placed.parts``.
+        index (Q,) of the object pair, and the two parts (Q,), (Q,) as rows of ``placed.parts``.
     """
     sizes = placed.count[first] * placed.count[second]
     pair = np.repeat(np.arange(len(first)), sizes)

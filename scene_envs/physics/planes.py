@@ -21,7 +21,7 @@ CLEARANCE = 2e-5
 _REACH = 0.02
 """Objects nearer than this (m) are kept apart although they do not overlap."""
 _SLACK = 300.0
-"""How much more a metre of overlap costs than a metre of distance, squared in the objective."""
+"""Cost of a metre of overlap relative to a metre of distance, squared in the objective."""
 _MET = 1e-7
 """A plane broken by less than this (m) is met."""
 _APART = 1e-6
@@ -38,19 +38,12 @@ _ROWS_SQUARED = 25.0
 
 @dataclass(frozen=True, eq=False)
 class Planes(Rows):
-    """Half-spaces: ``direction . (x_second - x_first) >= bound``; object -1 is the world's origin.
+    """Half-spaces: ``direction . (x_second - x_first) >= bound``; object -1 is the world's origin."""
 
-    Attributes:
-        first: (Q,) object rows, or -1.
-        second: (Q,) object rows.
-        direction: (Q, 3) unit.
-        bound: (Q,) m.
-    """
-
-    first: Index
-    second: Index
-    direction: Array
-    bound: Array
+    first: Index  # (Q,) object rows, or -1
+    second: Index  # (Q,) object rows
+    direction: Array  # (Q, 3) unit
+    bound: Array  # (Q,) m
 
 
 def near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
@@ -70,13 +63,12 @@ def separating_planes(
     least move away from home is taken. Coarse parts are used where they are already apart, fine ones elsewhere.
 
     Args:
-        collider: geometry and exact distances.
-        objects: of one scene, at their current translations.
-        first: (P,) object rows.
-        second: (P,) object rows.
-        extra: (P, 3) m, added to the offset of each pair: the minimum translation, for pairs that overlap.
+        collider: Geometry and exact distances.
+        objects: Objects of one scene, at their current translations.
+        first, second: (P,) object rows.
+        extra: (P, 3) vector added to the offset of each pair, m: the minimum translation, for pairs that overlap.
         home: (n, 3) wanted translations of the objects, m.
-        budget: charged with one unit per plane.
+        budget: Work budget, charged with one unit per plane.
     """
     coarse, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
     budget.spend(len(coarse.pair))
@@ -91,7 +83,7 @@ def separating_planes(
 
 @dataclass(frozen=True, eq=False)
 class _PartPlanes:
-    """One plane per near pair of parts; ``pair`` (Q,) says which object pair."""
+    """One plane per near pair of parts; ``pair`` (Q,) is the index of the object pair."""
 
     pair: Index
     first: Index
@@ -133,7 +125,7 @@ def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget, cost:
     """Translations (n, 3) nearest to ``home`` that satisfy the planes as well as possible.
 
     Groups of objects that no plane connects are solved separately. ``budget`` is charged with the rows solved.
-    ``cost`` (3,) is that of a metre along each axis of the world; None means 1.
+    ``cost`` (3,) is the cost of a metre along each axis of the world; None means 1.
     """
     if cost is not None:
         direction = planes.direction / cost

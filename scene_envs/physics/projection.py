@@ -32,15 +32,11 @@ TOLERANCE = 1e-4
 WORK = 10_000.0
 """Units of work (pairs of convex parts, or rows solved) until a search ends."""
 SEARCHES = 5
-"""Limit of searches per scene: the first from where the objects are, the others after overlapping objects were spread.
-
-With three searches, it depended on the rounding of the processor's BLAS whether the last two of 22 objects at one point
-came apart.
-"""
+"""Limit of searches per scene: the first from the given poses, the others after overlapping objects were spread."""
 _OVERLAPPING = 2_000_000
 """Limit of corner tests in overlapping object pairs; more are too much work for minimum translations."""
 _ROUNDS = 30
-"""Largest number of rounds of a search; objects that still overlap after them are left as they are."""
+"""Largest number of rounds of a search; objects that still overlap after them are not moved further."""
 _PATIENCE = 10
 """A search also ends after more rounds than this without any improvement."""
 _REFINEMENTS = 8
@@ -57,30 +53,22 @@ _OUTSIDE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Translations of one scene's objects after projection.
+    """Translations of one scene's objects after projection."""
 
-    Attributes:
-        translation: (n, 3) m.
-        residual_depth: deepest overlap that is left, m.
-        total_depth: sum over object pairs of the overlap that is left, m.
-        overlapping: (n,) bool, objects that still overlap another one.
-        heap: whether objects were so deep in each other that they were spread first.
-    """
-
-    translation: Array
-    residual_depth: float
-    total_depth: float
-    overlapping: Mask
-    heap: bool = False
+    translation: Array  # (n, 3) m
+    residual_depth: float  # deepest overlap that is left, m
+    total_depth: float  # sum of the overlaps of object pairs that are left, m
+    overlapping: Mask  # (n,) bool, objects that still overlap another one
+    heap: bool = False  # whether the objects were a heap, which was spread before the first round
 
 
 def project_objects(collider: Collider, objects: Objects, workspace: Corners) -> Projection:
     """Project the objects of one scene.
 
     Args:
-        collider: geometry of the assets, and the measure of overlap.
-        objects: one scene; fixed objects do not move.
-        workspace: lowest and highest corner (m) for the translations of objects in it or close to it.
+        collider: Geometry of the assets, and the measure of overlap.
+        objects: Objects of one scene; fixed ones do not move.
+        workspace: Lowest and highest corner (m) for the translations of objects in it or close to it.
     """
     home = objects.translation
     bounds = _bounds(home, objects, workspace)
@@ -104,14 +92,14 @@ def separated(
 ) -> Array:
     """Translations (n, 3) after one round of projection of overlapping objects and their neighbours.
 
-    A heap of objects, which would take too much work, is left as it is.
+    A heap of objects, which would take too much work, is not changed.
 
     Args:
-        collider: geometry of the assets.
-        objects: of one scene; fixed ones do not move.
+        collider: Geometry of the assets.
+        objects: Objects of one scene; fixed ones do not move.
         first, second: (P,) object rows of the pairs that overlap.
-        workspace: lowest and highest corner (m) for the translations.
-        cost: (3,) of a metre along each axis of the world; among several ways out of an overlap, the cheapest is taken.
+        workspace: Lowest and highest corner (m) for the translations.
+        cost: (3,) cost of a metre along each axis of the world; the cheapest way out of an overlap is taken.
     """
     if not len(first) or corner_tests(collider.library, objects, first, second).sum() > _OVERLAPPING:
         return objects.translation
@@ -178,7 +166,7 @@ def _round(
     budget: Budget,
     cost: Array | None = None,
 ) -> Array:
-    """The next translations: overlapping pairs (``first``, ``second``) come free, other ``near`` pairs stay apart."""
+    """The next translations: they free overlapping pairs (``first``, ``second``) and keep other ``near`` ones apart."""
     near_first, near_second = near
     extra = np.zeros((len(near_first), 3))
     if len(first):

@@ -1,4 +1,4 @@
-"""Simulation-ready scenes: rounds of projection and settling, and the trials by which an object is judged ready."""
+"""Simulation-ready scenes: rounds of projection and settling, and the trials that a ready object passes."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from scene_envs.scene import SceneBatch
 _READY_DEPTH = 1e-4
 """Deepest overlap (m) of a ready object with another one."""
 _LEAN = 0.12
-"""Angle (rad) by which gravity is tilted when a ready object has to hold: a leaning object that only just holds in one
-simulator creeps in another."""
+"""Tilt of gravity (rad) at which a ready object has to hold: an object that barely leans in one simulator creeps in
+another."""
 _STAYS: dict[str, Any] = {"max_displacement": 1e-3, "max_rotation": 1e-2}
 _HOLDS: dict[str, Any] = {"max_displacement": 2e-3, "max_rotation": 2e-2, "duration": 0.5}
 _LASTING: tuple[dict[str, Any], ...] = ({"duration": 2.0} | _STAYS, {"duration": 2.0} | _STAYS)
 """The longest trials: time (s) and limits of motion (m, rad). The second is made where the first removed an object."""
 _UPRIGHT: tuple[dict[str, Any], ...] = ({"duration": 0.1} | _STAYS, {"duration": 0.5} | _STAYS)
-"""The shorter trials, which come first in every round: they find most of the objects that move, at less cost."""
+"""The shorter trials, made first in every round: they find most of the objects that move, at less cost."""
 _LEANING: tuple[dict[str, Any], ...] = tuple(
     {"tilt": (x * _LEAN / math.sqrt(2), y * _LEAN / math.sqrt(2))} | _HOLDS for x in (-1, 1) for y in (-1, 1)
 )
 """Trials with tilted gravity, in four directions. In a round they are made for scenes that pass the shorter trials, and
 at the end for scenes that did not pass all trials of their round."""
 _PATIENCE = 2
-"""Rounds without more ready objects after which a scene is left as it is."""
+"""Number of rounds without more ready objects after which a scene has no further round."""
 _ROUNDS_SHARE = 0.5
 """Share of a scene's work that the rounds may do; the rest is for the trials at the end."""
 _UNMOVED = 1e-4
-"""Motion (m) below which an object is believed not to depend on others that move."""
+"""Motion (m) below which an object counts as independent of others that move."""
 
 
 def make_ready(
@@ -61,8 +61,8 @@ def make_ready(
 
     Args:
         batch: B scenes of N slots.
-        duration: longest time to settle in each round, s.
-        rounds: most rounds per scene, at least 1.
+        duration: Longest time to settle in each round, s.
+        rounds: Largest number of rounds per scene, at least 1.
         pool: worker processes; None computes in this process.
 
     Raises InvalidInputError, also for ``rounds`` below 1, and MissingDependencyError as :func:`feasibility` does.
@@ -76,7 +76,7 @@ def make_ready(
     best = last = _make_ready_once(batch, duration, ITERATIONS, units, pool)
     tensor, ready, counts = best.batch.tensor.clone(), best.ready.clone(), best.counts.clone()
     lasting = best.lasting.clone()
-    scenes = torch.arange(len(batch))  # that went through the last round
+    scenes = torch.arange(len(batch))  # scenes of the last round
     without_gain = torch.zeros(len(batch), dtype=torch.int64)  # rounds in a row
     for _ in range(rounds - 1):
         unready = last.batch.is_free & last.batch.in_workspace & ~last.ready
@@ -110,21 +110,13 @@ def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """Scenes after one round of :func:`make_ready`.
+    """Scenes after one round of :func:`make_ready`."""
 
-    Attributes:
-        batch: the settled scenes.
-        ready: (B, N) free objects that passed the trials of a round.
-        valid: (B,) whether projection and settling gave an answer.
-        finished: (B,) whether the round ended before its work was spent.
-        lasting: (B,) whether all trials of the round were made, the longest included, and no object moved in them.
-    """
-
-    batch: SceneBatch
-    ready: Tensor
-    valid: Tensor
-    finished: Tensor
-    lasting: Tensor
+    batch: SceneBatch  # settled scenes
+    ready: Tensor  # (B, N) free objects that passed the trials of a round
+    valid: Tensor  # (B,) whether projection and settling gave an answer
+    finished: Tensor  # (B,) whether the round ended before its work was spent
+    lasting: Tensor  # (B,) whether all trials of the round were made, the longest included, and no object moved in them
 
     @property
     def counts(self) -> Tensor:
@@ -204,7 +196,7 @@ def _strike_until_still(batch: SceneBatch, ready: Tensor, units: Tensor, pool: P
 def _judge(
     kept: SceneBatch, scenes: Tensor, trial: dict[str, Any], units: Tensor, pool: PhysicsPool | None
 ) -> tuple[Tensor, Tensor]:
-    """Objects (b, N) that stay where they are, none in invalid scenes, and the displacement (b, N) m of all objects."""
+    """Objects (b, N) that keep their pose, none in invalid scenes, and the displacement (b, N) m of all objects."""
     options = {"max_penetration": _READY_DEPTH} | trial
     rows = run_kernel("feasibility", kept, options, pool, units[scenes])
     units[scenes] -= spent(rows)

@@ -38,34 +38,21 @@ _DEEPEST = 2e-3
 
 @dataclass(frozen=True, eq=False)
 class Rest(Rows):
-    """Objects whose motion has a closed form.
+    """Objects whose motion has a closed form."""
 
-    Attributes:
-        still: (n,) bool; free objects that need no simulation.
-        rise: (n,) m, how far each of them moves up; negative is down. 0 elsewhere.
-        tilt: (n,) rad, the angle by which it comes to stand upright.
-    """
-
-    still: Mask
-    rise: Array
-    tilt: Array
+    still: Mask  # (n,) bool; free objects that need no simulation
+    rise: Array  # (n,) m, upward motion of each of them, negative for downward; 0 elsewhere
+    tilt: Array  # (n,) rad, angle that each of them turns to stand upright
 
 
 @dataclass(frozen=True, eq=False)
 class _Polygons:
-    """Convex polygons in the asset's xy plane, padded with copies of their first corner and edge.
+    """Convex polygons in the asset's xy plane, padded with copies of their first corner and edge."""
 
-    Attributes:
-        height: (P,) z in the asset frame, m; NaN where there is no polygon.
-        corners: (P, V, 2) m.
-        normals: (P, V, 2) outward.
-        offsets: (P, V) m; inside is ``normals @ x <= offsets``.
-    """
-
-    height: Array
-    corners: Array
-    normals: Array
-    offsets: Array
+    height: Array  # (P,) z in the asset frame, m; NaN where there is no polygon
+    corners: Array  # (P, V, 2) m
+    normals: Array  # (P, V, 2) outward
+    offsets: Array  # (P, V) m; inside is ``normals @ x <= offsets``
 
     @classmethod
     def of(cls, polygons: list[tuple[float, Array] | None]) -> _Polygons:
@@ -86,18 +73,14 @@ class _Polygons:
         return cls(height, corners, normals, offsets)
 
     def outside(self, rows: Index, points: Array) -> Array:
-        """(Q, K): how far (m) points (Q, K, 2) in the asset frame lie outside polygons ``rows`` (Q,)."""
+        """(Q, K) m, distance of points (Q, K, 2) in the asset frame outside polygons ``rows`` (Q,)."""
         normals, offsets = self.normals[rows][:, None], self.offsets[rows][:, None]
         along = normals[..., 0] * points[:, :, None, 0] + normals[..., 1] * points[:, :, None, 1]
         return (along - offsets).max(axis=2)  # type: ignore[no-any-return]
 
 
 class Statics:
-    """Closed-form test of rest, from precomputed feet and surfaces.
-
-    Args:
-        library: geometry of the assets.
-    """
+    """Closed-form test of rest, from precomputed feet and surfaces."""
 
     def __init__(self, library: LibraryGeometry) -> None:
         self._library = library
@@ -118,14 +101,7 @@ class Statics:
         self._foot_center = np.array([(0.0, 0.0) if bottom is None else bottom.center for bottom in bottoms])
 
     def at_rest(self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, duration: float) -> Rest:
-        """Objects that need no simulation for ``duration`` seconds.
-
-        Args:
-            objects: the objects of one or more scenes.
-            pairs: their near pairs.
-            contacts: the near parts of these pairs.
-            duration: s.
-        """
+        """Objects of one or more scenes that need no simulation for ``duration`` seconds."""
         count = len(objects)
         tilt = np.hypot(objects.rotation[:, 0, 2], objects.rotation[:, 1, 2])
         upright = (tilt < _FLAT) & (objects.rotation[:, 2, 2] > 0)
@@ -239,7 +215,7 @@ class Statics:
 
 
 def _rises(support: Index, drop: Array, fixed: Mask) -> tuple[Array, Index]:
-    """How far (m) each object moves up until it meets its support, and how many objects carry it."""
+    """Upward motion (m) of each object until it meets its support, and the number of objects that carry it."""
     rise, height = np.zeros(len(support)), np.zeros(len(support), dtype=np.int64)
     carried = np.flatnonzero(support >= 0)
     under = support[carried]

@@ -14,10 +14,10 @@ class FeasibilityResult:
     """The verdict per object.
 
     Attributes:
-        feasible: (B, N) bool; free objects that pass. Welded and empty slots are False.
+        feasible: (B, N) bool; True for free objects that pass, False for welded and empty slots.
         depth: (B, N) m, deepest overlap of each object with any other, welded ones included.
-        displacement: (B, N) m, how far the object frame moved; 0 where the object was not simulated.
-        rotation: (B, N) rad, the angle it turned.
+        displacement: (B, N) m, motion of the object frame; 0 where the object was not simulated.
+        rotation: (B, N) rad, angle that the object turned.
         valid: (B,) bool; False where physics could not judge the scene. All other fields are 0 there.
         counts: (B,) int64, feasible objects per scene.
     """
@@ -35,10 +35,10 @@ class ObjectPair:
     """Two overlapping objects of one scene.
 
     Attributes:
-        slots: their slots.
-        depth: deepest overlap of any two of their convex parts, m.
-        total: sum over all overlapping pairs of convex parts, m.
-        part_pairs: how many pairs of convex parts overlap.
+        slots: Slots of the two objects.
+        depth: Deepest overlap of any two of their convex parts, m.
+        total: Sum of the overlaps of all pairs of their convex parts, m.
+        part_pairs: Number of overlapping pairs of convex parts.
     """
 
     slots: tuple[int, int]
@@ -52,7 +52,7 @@ class PenetrationResult:
     """Overlap between objects; pairs of welded objects do not count.
 
     Attributes:
-        pairs: per scene, the overlapping object pairs in slot order.
+        pairs: Overlapping object pairs of each scene, in slot order.
         depth: (B, N) m, deepest overlap of each object.
         total_per_pair: (B,) m, the sum over object pairs of their depth.
         total_per_geometry: (B,) m, the sum over all pairs of convex parts (the literature's measure).
@@ -86,8 +86,8 @@ class SettleResult:
     """Scenes after they came to rest.
 
     Attributes:
-        batch: the scenes at their new poses; invalid rows as they were.
-        displacement: (B, N) m, from the given poses.
+        batch: Scenes at their new poses; invalid rows are unchanged.
+        displacement: (B, N) m, distance from the given poses.
         rotation: (B, N) rad.
         finished: (B,) bool; False where the scene's work budget was spent first: objects are at the poses reached, and
             may be moving. False also where ``valid`` is False.
@@ -106,11 +106,11 @@ class ProjectionResult:
     """Scenes moved to the nearest translations without overlap.
 
     Attributes:
-        batch: the projected scenes; rotations and welded objects as they were.
-        converged: (B,) bool; no overlap deeper than the tolerance is left.
+        batch: Projected scenes; rotations and welded objects are unchanged.
+        converged: (B,) bool; True where no overlap deeper than the tolerance is left.
         residual_depth: (B,) m, deepest overlap left.
-        moved: (B, N) m, how far each object was moved.
-        heap: (B,) bool; objects were so deep in each other that they were spread to free places.
+        moved: (B, N) m, distance that each object was moved.
+        heap: (B,) bool; True where objects overlapped so deeply that they were spread to free places.
         valid: (B,) bool.
     """
 
@@ -127,12 +127,12 @@ class ReadyResult:
     """Scenes made ready for a simulator.
 
     Attributes:
-        batch: projected and settled scenes, of the best round each.
+        batch: Projected and settled scenes, each of its best round.
         ready: (B, N) bool; free objects that are simulation-ready there (see :func:`make_ready`).
         counts: (B,) int64, ready objects per scene.
         finished: (B,) bool; False where the scene's work budget was spent first: the batch is the best effort, and
             objects that were not judged are not ready. False also where ``valid`` is False.
-        valid: (B,) bool, of the first round.
+        valid: (B,) bool; False where the first round could not judge the scene.
     """
 
     batch: SceneBatch

@@ -1,7 +1,7 @@
 """Rotations of many bodies at once in numpy, in PyBullet's quaternion order.
 
-Every row is computed by the same operations whatever the other rows are, so a scene settles to the same bits alone and
-in a batch. scipy's ``Rotation`` picks its formula per batch and promises no such thing.
+The operations on a row do not depend on the other rows, so a scene settles to the same bits alone and in a batch.
+scipy's ``Rotation`` chooses its formula per batch and does not guarantee this.
 """
 
 from __future__ import annotations

@@ -18,22 +18,16 @@ from scene_envs.physics.parts import SIZE_CLASSES
 
 _CLASSES = len(SIZE_CLASSES) + 1
 _BLOCK = 1 << 16
-"""Face-corner combinations looked at together: their arrays stay in the cache."""
+"""Face-corner combinations computed together: their arrays stay in the cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedParts:
-    """Parts of placed objects.
+    """Parts of placed objects."""
 
-    Attributes:
-        part: (I,) index of the part in the library.
-        rotation: (I, 3, 3), asset frame to world.
-        translation: (I, 3) m, world.
-    """
-
-    part: Index
-    rotation: Array
-    translation: Array
+    part: Index  # (I,) index of the part in the library
+    rotation: Array  # (I, 3, 3), asset frame to world
+    translation: Array  # (I, 3) m, world
 
 
 def rotate(rotation: Array, points: Array) -> Array:
@@ -43,18 +37,11 @@ def rotate(rotation: Array, points: Array) -> Array:
 
 
 def separations(library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index) -> tuple[Array, Array]:
-    """Largest signed gap of each pair of placed parts over all face directions of both.
-
-    Args:
-        library: geometry of the assets.
-        placed: the parts.
-        first: (P,) rows of ``placed``.
-        second: (P,) rows of ``placed``.
+    """Largest signed gap of each pair of ``placed`` parts, rows (P,), over all face directions of both.
 
     Returns:
-        gap (P,) m, positive when a face plane separates the pair, and the direction (P, 3) of that plane
-        in the world, from the first part to the second. The true distance is at least ``gap``; the true
-        depth is at most ``-gap``.
+        gap (P,) m, positive when a face plane separates the pair, and the direction (P, 3) of that plane in the world,
+        from the first part to the second. The true distance is at least ``gap``, the true depth at most ``-gap``.
     """
     gap = np.empty(len(first))
     direction = np.empty((len(first), 3))
@@ -96,14 +83,9 @@ def _one_group(
 def grouped_gaps(
     library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index, shift: Array
 ) -> Iterator[tuple[Index, Array, Array]]:
-    """Signed gaps of pairs of placed parts over *all* face directions of both, in groups of equal size.
+    """Signed gaps of pairs of ``placed`` parts, rows (P,), over *all* face directions of both, in groups of equal size.
 
-    Args:
-        library: geometry of the assets.
-        placed: the parts.
-        first: (P,) rows of ``placed``.
-        second: (P,) rows of ``placed``.
-        shift: (P, 3) m, from the origin of the first part's object to that of the second's.
+    ``shift`` (P, 3) m leads from the origin of the first part's object to the origin of the second part's object.
 
     Yields:
         rows (Q,) of the pairs, gaps (Q, K) m, and directions (Q, K, 3) in the world, from first to second.

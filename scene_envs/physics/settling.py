@@ -32,13 +32,13 @@ def settle_scene(
     """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether they stayed finite.
 
     Args:
-        physics: of the scene's assets.
-        objects: of one scene.
-        pairs: their near pairs.
-        duration: s, the longest time to simulate.
-        iterations: of the solver per step.
-        bottom: height (m) below which objects are left where they are.
-        budget: units of simulation; when they are spent, objects stay where they have got to.
+        physics: Physics of the scene's assets.
+        objects: Objects of one scene.
+        pairs: Near pairs of the objects.
+        duration: Longest time to simulate, s.
+        iterations: Solver iterations per step.
+        bottom: Height (m) below which objects are simulated no further.
+        budget: Units of simulation; when they are spent, objects stay at the poses reached.
     """
     current = objects
     calm = np.zeros(len(objects), dtype=bool)  # was simulated, and did not move

@@ -22,11 +22,11 @@ _HEAP = 3_000_000
 _DEEP = 5e-3
 """Such a group is a heap when objects whose boxes have most in common overlap deeper than this (m)."""
 _LOOKED_AT = 3
-"""Object pairs that are measured for this: those whose common box is the largest share of the smaller box."""
+"""Number of object pairs measured for this: those whose common box is the largest share of the smaller box."""
 _WINDOWS = (0.3, 1.0, 4.0, 20.0)
 """Half widths (m) of the cubes around a wanted place that are searched, one after the other."""
 _BINS = 16
-"""Coordinates looked at along each axis come from this many equal intervals, at most two from each."""
+"""Coordinates tested along each axis come from this many equal intervals, at most two from each."""
 _FIXED = 1000
 """Overlapping a box of a fixed object counts as much as overlapping this many free objects."""
 
@@ -63,11 +63,11 @@ def spread(
     """Translations (n, 3) m at which the boxes of the chosen objects meet no other box, as far as there is room.
 
     Args:
-        library: geometry of the assets.
-        objects: of one scene; those not chosen stay.
+        library: Geometry of the assets.
+        objects: Objects of one scene; those not chosen stay.
         chosen: (n,) free objects to place anew.
-        wanted: (n, 3) m, where the chosen objects should be.
-        bounds: lowest and highest translations (n, 3), (n, 3) m.
+        wanted: (n, 3) wanted translations of the chosen objects, m.
+        bounds: Lowest and highest translations (n, 3), (n, 3) m.
     """
     coarse = place(library, objects, "coarse")
     low, high = object_boxes(coarse)
@@ -124,7 +124,7 @@ def _free_place(wanted: Array, low: Array, high: Array, weight: Index, limits: t
 
 
 def _lines(faces: Array, wanted: float, start: float, end: float) -> Array:
-    """Ascending coordinates to look at: the wanted one, both ends, and faces between them, thinned evenly."""
+    """Ascending coordinates to test: the wanted one, both ends, and faces between them, thinned evenly."""
     inside = np.sort(faces[(faces > start) & (faces < end)])
     bins = np.minimum((inside - start) / max(end - start, 1e-12) * _BINS, _BINS - 1).astype(np.int64)
     lowest = np.searchsorted(bins, np.arange(_BINS))

@@ -21,10 +21,9 @@ _SAME_DEPTH = 1e-4
 _UPRIGHT = 0.999
 """Cosine of the tilt up to which faces count as facing each other."""
 _CLEAR = 0.01
-"""Objects are simulated in one cluster when they are within this distance (m) of each other sideways, and
-within ``_CLEAR_ABOVE`` in height."""
 _CLEAR_ABOVE = 0.06
-"""Distance (m) in height within which such objects are simulated in one cluster."""
+"""Objects are simulated in one cluster when they are within ``_CLEAR`` (m) of each other sideways and within
+``_CLEAR_ABOVE`` (m) in height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +46,7 @@ class _Faces:
 
 
 class Support:
-    """Test of contacts, from precomputed faces.
-
-    Args:
-        library: geometry of the assets.
-    """
+    """Test of contacts, from precomputed faces."""
 
     def __init__(self, library: LibraryGeometry) -> None:
         self.hollow = np.array([asset.is_hollow for asset in library.assets])
@@ -59,12 +54,7 @@ class Support:
         self.top = _Faces.of([asset.top for asset in library.assets])
 
     def needs_fine(self, objects: Objects, pairs: ObjectPairs) -> Mask:
-        """(n,) objects that must collide with their fine parts.
-
-        Args:
-            objects: the objects.
-            pairs: their near pairs.
-        """
+        """(n,) objects that must collide with their fine parts."""
         different = self.differs(objects, pairs)
         fine = np.zeros(len(objects), dtype=bool)
         fine[pairs.first[different]] = True
@@ -77,10 +67,6 @@ class Support:
         Coarse shapes act like fine ones in three kinds of contact. The solid outlines of two facing flat faces meet
         all the way round; or an object lies on a flat surface that is larger than it; or two upright objects are side
         by side.
-
-        Args:
-            objects: the objects.
-            pairs: their near pairs.
         """
         a, b = pairs.first, pairs.second
         relevant = (pairs.gap < _REACH) & (self.hollow[objects.category[a]] | self.hollow[objects.category[b]])
@@ -93,8 +79,8 @@ class Support:
             | self._on_plane(objects, upper, lower, pairs.low, pairs.high)
         )
         upright = objects.rotation[:, 2, 2] > _UPRIGHT
-        beside = (np.abs(pairs.direction[:, 2]) < 0.1) & upright[a] & upright[b]
-        return relevant & ~(same_depth & (alike | beside))
+        side_by_side = (np.abs(pairs.direction[:, 2]) < 0.1) & upright[a] & upright[b]
+        return relevant & ~(same_depth & (alike | side_by_side))
 
     def _meets_all_round(self, objects: Objects, upper: Index, lower: Index, gap: Array) -> Mask:
         up, down = objects.category[upper], objects.category[lower]
@@ -120,7 +106,7 @@ class Support:
             return larger & (self.top.hole[down] == 0) & (objects.rotation[lower, 2, 2] > _UPRIGHT)  # type: ignore[no-any-return]
 
     def tallest(self, objects: Objects, pairs: ObjectPairs) -> Index:
-        """(n,) how many objects carry each object, one above the other (0 on a fixed surface)."""
+        """(n,) number of objects that carry each object, one above the other (0 on a fixed surface)."""
         vertical = (np.abs(pairs.direction[:, 2]) > 0.5) & (pairs.gap < _REACH)
         a, b = pairs.first[vertical], pairs.second[vertical]
         first_above = pairs.direction[vertical, 2] < 0

@@ -16,7 +16,7 @@ from scene_envs.physics.geometry import LibraryGeometry
 from scene_envs.physics.placement import Objects
 
 _LOOK = 12
-"""Steps between checks of which clusters are at rest."""
+"""Number of steps between checks for clusters at rest."""
 _USUAL_ITERATIONS = 35
 """Solver iterations of a step that costs one unit of work per free object."""
 _STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
@@ -25,31 +25,20 @@ _STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """Settings of the integration of motion.
+    """Settings of the integration of motion."""
 
-    Attributes:
-        time_step: s.
-        iterations: of the sequential-impulse solver per step.
-        linear_damping: fraction of velocity lost per second.
-        angular_damping: fraction of angular velocity lost per second.
-        tilt: (x, y) rad by which gravity is tilted toward the x and the y axis.
-    """
-
-    time_step: float = 1.0 / 240.0
-    iterations: int = 50
-    linear_damping: float = 0.0
-    angular_damping: float = 0.0
-    tilt: tuple[float, float] = (0.0, 0.0)
+    time_step: float = 1.0 / 240.0  # length of a step, s
+    iterations: int = 50  # iterations of the sequential-impulse solver per step
+    linear_damping: float = 0.0  # fraction of velocity lost per second
+    angular_damping: float = 0.0  # fraction of angular velocity lost per second
+    tilt: tuple[float, float] = (0.0, 0.0)  # (x, y) angles by which gravity is tilted toward the x and the y axis, rad
 
 
 class World:
     """PyBullet for one asset library; the motion of a scene depends on that scene alone, bit for bit.
 
-    Bodies are sorted, placed and parked in the same order whatever the slot order, and never sleep. Threads take turns.
-    A call that is interrupted leaves nothing behind.
-
-    Args:
-        library: geometry of the assets.
+    The order in which bodies are sorted, placed and parked does not depend on the slot order, and bodies never sleep.
+    Threads take turns. A call that is interrupted leaves no bodies behind.
 
     Raises:
         MissingDependencyError: pybullet is not installed.
@@ -66,18 +55,17 @@ class World:
         """Move the objects of one scene for ``duration`` seconds under gravity.
 
         Args:
-            objects: the n objects.
-            fine: (n,) whether each object collides with its fine parts.
-            group: (n,) number of the cluster of each free object; a cluster leaves the
-                simulation when all of it is at rest.
-            duration: s.
-            settings: integration.
-            budget: units of simulation; when they are spent, everything stays where it is.
+            objects: The n objects.
+            fine: (n,) bool; True for objects that collide with their fine parts.
+            group: (n,) number of the cluster of each free object; a cluster leaves the simulation when it is at rest.
+            duration: Simulated time, s.
+            settings: Settings of the integration.
+            budget: Units of simulation; when they are spent, all objects stay at the poses reached.
 
         Returns:
-            rotation (n, 3, 3) and translation (n, 3) m afterwards, the angle turned (n,) in radians, and which objects
-            (n,) left before the end: those at rest, or all when the budget was spent. Objects that Bullet lost to a
-            numerical failure come back as NaN.
+            rotation (n, 3, 3) and translation (n, 3) m afterwards, the angle turned (n,) in radians, and the objects
+            (n,) that left before the end: those at rest, or all when the budget was spent. Objects that Bullet lost to
+            a numerical failure come back as NaN.
         """
         with self._lock:
             try:
@@ -99,13 +87,8 @@ class World:
         bodies, order = self._bodies(objects, fine)
         damping = settings.linear_damping, settings.angular_damping
         for row in order:
-            self._pool.wake(
-                int(bodies[row]),
-                int(category[row]),
-                start_quaternion[row].tolist(),
-                fixed=bool(fixed[row]),
-                damping=damping,
-            )
+            turn = start_quaternion[row].tolist()
+            self._pool.wake(int(bodies[row]), int(category[row]), turn, fixed=bool(fixed[row]), damping=damping)
         # After waking: Bullet sets the gravity of active bodies only.
         down = SCALE * GRAVITY * np.array([*np.sin(settings.tilt), -np.cos(np.hypot(*settings.tilt))])
         bullet.setGravity(*down.tolist(), physicsClientId=client)
@@ -167,7 +150,7 @@ class World:
         return bodies, order
 
     def _is_still(self, bodies: Index, duration: float) -> bool:
-        """Whether all of these bodies are at rest, that is slower than the limits."""
+        """Whether all of these bodies are slower than the limits of rest."""
         speed, turn = _STILL_WAY * SCALE / duration, _STILL_ANGLE / duration
         for body in bodies.tolist():
             linear, angular = self._pool.bullet.getBaseVelocity(body, physicsClientId=self._pool.client)
@@ -176,7 +159,7 @@ class World:
         return True
 
     def _leave(self, bodies: Index, category: Index, rows: Index, position: Array, quaternion: Array) -> None:
-        """Write down where bodies are (Bullet units), and park them."""
+        """Write the poses of bodies (Bullet units) into ``position`` and ``quaternion``, and park the bodies."""
         for row in rows.tolist():
             body = int(bodies[row])
             position[row], quaternion[row] = self._pool.bullet.getBasePositionAndOrientation(

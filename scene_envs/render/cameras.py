@@ -16,15 +16,15 @@ _LAMP_PIXELS = 512, 1024
 
 
 def picture_camera(scene_type: str | SceneType, width: int = 480, height: int = 360) -> Camera:
-    """The three-quarter view that pictures use when no camera is given.
+    """The three-quarter view of pictures without a given camera.
 
     It is derived from the workspace and the fixed objects (see
-    :func:`~scene_envs.render.framing.frame_scene_type`), so it also suits scene types of your own.
+    :func:`~scene_envs.render.framing.frame_scene_type`), so it also suits users' scene types.
 
     Args:
-        scene_type: the scene type or its name.
-        width: image width, pixels; with the height it decides how far away the camera must be.
-        height: image height, pixels.
+        scene_type: Scene type or its name.
+        width: Image width, pixels; width and height determine the distance of the camera.
+        height: Image height, pixels.
 
     >>> camera = picture_camera("dimsum_table", 640, 480)
     >>> camera.width, camera.fov_y

@@ -18,19 +18,12 @@ _RAYS = 24
 
 @dataclass(frozen=True, eq=False)
 class Framing:
-    """Points to show, with the directions of camera and lamp.
+    """Points to show, with the directions of camera and lamp."""
 
-    Attributes:
-        points: (P, 3) m, world frame; all of them belong in the picture.
-        to_camera: (3,) unit vector from the scene towards the camera.
-        to_light: (3,) unit vector from the scene towards the lamp.
-        ground: z below which nothing stands, m.
-    """
-
-    points: Array
-    to_camera: Array
-    to_light: Array
-    ground: float
+    points: Array  # (P, 3) points that the picture shows, world frame, m
+    to_camera: Array  # (3,) unit vector from the scene towards the camera
+    to_light: Array  # (3,) unit vector from the scene towards the lamp
+    ground: float  # lowest z of all supports, m
 
     @property
     def center(self) -> Array:
@@ -75,17 +68,17 @@ def frame_scene_type(scene_type: SceneType) -> Framing:
 
 
 def scene_type_of_one(scene_type: SceneType, translations: Array, rotations: Array, categories: Index) -> SceneType:
-    """Scene type for the framing of one scene: its only support counts as fixed, in types that hold tables and rooms.
+    """Scene type for the framing of one scene, in which its only support counts as fixed.
 
     A union of scene types has no fixed objects and the workspace of the largest type, in which a table would be tiny. A
     scene with one welded object is framed as if this object were fixed there; any other scene is framed as
     ``scene_type``.
 
     Args:
-        scene_type: of the scene.
-        translations: (N, 3) m.
-        rotations: (N, 3, 3).
-        categories: (N,) int64, empty ones being the number of assets.
+        scene_type: Scene type of the scene.
+        translations: (N, 3) translations, m.
+        rotations: (N, 3, 3) rotations.
+        categories: (N,) int64; the number of assets is the category of empty slots.
     """
     names = np.array([*scene_type.assets, ""])[categories]
     supports = np.flatnonzero(np.isin(names, scene_type.welded))
@@ -112,11 +105,11 @@ def fit_camera(points: Array, to_camera: Array, fov_y: float, aspect: float, mar
     """Position and target (m) of the nearest camera without roll that sees all points.
 
     Args:
-        points: (P, 3) m.
+        points: (P, 3) points, m.
         to_camera: (3,) unit vector from the scene to the camera; not vertical.
-        fov_y: vertical field of view, degrees.
-        aspect: width / height.
-        margin: part of the half image that stays free at each border.
+        fov_y: Vertical field of view, degrees.
+        aspect: Ratio of width to height.
+        margin: Share of the half image that stays free at each border.
     """
     right = np.cross(_TOP, to_camera)
     right /= np.linalg.norm(right)
@@ -124,10 +117,10 @@ def fit_camera(points: Array, to_camera: Array, fov_y: float, aspect: float, mar
     seen = points @ axes.T  # (P, 3): right, up, towards the camera
     slope = np.tan(np.radians(fov_y) / 2.0) * (1.0 - margin) * np.array([aspect, 1.0])
     # A camera at (x, y, d) sees a point when |x_p - x| <= slope_x (d - d_p), and the same for y.
-    most = (seen[:, :2] + slope * seen[:, 2:]).max(axis=0)
-    least = (-seen[:, :2] + slope * seen[:, 2:]).max(axis=0)
-    distance = float(((most + least) / (2.0 * slope)).max())
-    place = np.array([*(0.5 * (most - least)), distance])
+    upper = (seen[:, :2] + slope * seen[:, 2:]).max(axis=0)
+    lower = (-seen[:, :2] + slope * seen[:, 2:]).max(axis=0)
+    distance = float(((upper + lower) / (2.0 * slope)).max())
+    place = np.array([*(0.5 * (upper - lower)), distance])
     target = np.array([place[0], place[1], 0.5 * (seen[:, 2].min() + seen[:, 2].max())])
     return place @ axes, target @ axes
 
@@ -145,7 +138,7 @@ def _fixed_geometry(scene_type: SceneType) -> tuple[Array, Array]:
 
 
 def _open_side(boxes: Array) -> Array | None:
-    """The horizontal direction from which most can be seen; None if as much can be seen from straight above."""
+    """The horizontal direction with the clearest view; None if the view from straight above is as clear."""
     covered = [_covered(boxes, side) for side in _SIDES]
     return None if _covered(boxes, _TOP) <= min(covered) else _SIDES[int(np.argmin(covered))]
 

@@ -1,4 +1,4 @@
-"""Galleries: many images on one page."""
+"""Galleries of many images on one page."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def gallery(
     """Tile images on a white page, row by row, each with its caption below.
 
     Args:
-        images: at least one (H, W, 3) uint8 image, all of one size.
-        columns: images per row; fewer images than columns make one shorter row.
-        captions: one line per image.
-        gap: pixels between images and around the page.
+        images: One or more (H, W, 3) uint8 images of one size.
+        columns: Number of images per row; fewer images than columns make one shorter row.
+        captions: One line per image.
+        gap: Number of pixels between images and around the page.
 
     Returns:
         A PIL image.

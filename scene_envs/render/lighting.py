@@ -45,18 +45,18 @@ def soft_shadow(
     """(H, W) in 0..1: the part of the light that nearer objects hide, by percentage-closer filtering.
 
     Args:
-        frame: what the camera saw.
-        light: the same scene seen from the light.
-        normals: (H, W, 3) of :func:`surface_normals`.
-        bias: m by which an occluder must be nearer to the light than the point.
-        lift: m by which points are raised off their surface, against a surface shadowing itself.
-        softness: radius of the filter, pixels of ``light``.
-        taps: samples of the filter.
+        frame: Frame of the camera.
+        light: Frame of the same scene seen from the light.
+        normals: (H, W, 3) normals from :func:`surface_normals`.
+        bias: Smallest difference in distance from the light (m) between an occluder and the point.
+        lift: Distance (m) by which points are raised off their surface, so that no surface shadows itself.
+        softness: Radius of the filter, pixels of ``light``.
+        taps: Number of samples of the filter.
     """
     seen = np.isfinite(frame.depth)
     to_light = (light.view @ np.linalg.inv(frame.view)).astype(np.float32)
     points = (camera_points(frame)[seen] + np.float32(lift) * normals[seen]) @ to_light[:3, :3].T + to_light[:3, 3]
-    distance = np.maximum(-points[:, 2], np.float32(1e-3))  # objects may have flown past the lamp
+    distance = np.maximum(-points[:, 2], np.float32(1e-3))  # objects may lie behind the lamp
     height, width = light.depth.shape
     column = (points[:, 0] / distance * np.float32(light.focal[0]) + 1.0) * (0.5 * width)
     row = (1.0 - points[:, 1] / distance * np.float32(light.focal[1])) * (0.5 * height)
@@ -73,7 +73,7 @@ def soft_shadow(
 def contact_shade(frame: Frame, normals: Image, *, radius: float = 0.04, taps: int = 12, stride: int = 2) -> Image:
     """(H, W) in 0..1: ambient occlusion of each point by its surroundings within ``radius`` m.
 
-    Worked out for every ``stride``-th pixel of each axis and repeated; meant to be blurred.
+    Computed for every ``stride``-th pixel of each axis and repeated; callers blur the result.
     """
     grid = camera_points(frame)[::stride, ::stride]
     height, width = grid.shape[:2]

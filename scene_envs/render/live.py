@@ -1,4 +1,4 @@
-"""Live viewer: a page in the browser that shows scenes as they come."""
+"""Live viewer: a page in the browser that shows scenes as they are added."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class LiveViewer:
     The page lies in a temporary folder, and stays there when the viewer is closed.
 
     Args:
-        title: heading of the page.
+        title: Heading of the page.
 
     Attributes:
-        path: of the page.
+        path: Path of the page.
     """
 
     REFRESH = 2.0
@@ -42,7 +42,7 @@ class LiveViewer:
             logger.warn(f"no browser was found; open {self.path} in one")
 
     def close(self) -> None:
-        """Write the page once more, so that it is no longer read again; it stays in its folder."""
+        """Write the page a last time, without refresh; it stays in its folder."""
         if self._scenes:
             self._write(None)
             self._scenes, self._captions = [], []

@@ -1,4 +1,4 @@
-"""Images of scenes."""
+"""Renderer of scenes: lit pictures and semantic images."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def render(
         style: ``"picture"`` is a lit three-quarter view with soft shadows. In types without fixed objects, a scene with
             just one support is framed by this support. ``"semantic"`` is one flat colour per asset on white, seen by
             the camera of the scene type (the paper's: 640 x 480, 45 degrees).
-        camera: replaces the camera of the style.
-        width: image width, pixels; the camera's by default. The view of a picture is fitted to the image.
-        height: image height, pixels; the camera's by default.
+        camera: Camera in place of that of the style.
+        width: Image width, pixels; the camera's by default. The view of a picture is fitted to the image.
+        height: Image height, pixels; the camera's by default.
         highlight: (B, N) bool, objects to draw in red (pictures only).
 
     Returns:
@@ -85,7 +85,7 @@ def render(
 
 
 def _fitted_camera(scene_type: SceneType, width: int | None, height: int | None) -> Camera:
-    """The picture camera at the size asked for; a side that is not given has its default size."""
+    """The picture camera at the given size; None stands for the default size of a side."""
     default = picture_camera(scene_type)
     width, height = default.width if width is None else width, default.height if height is None else height
     return picture_camera(scene_type, width, height)

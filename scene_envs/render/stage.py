@@ -26,21 +26,13 @@ _CELL, _CELLS = 8, 32
 
 @dataclass(frozen=True)
 class Frame:
-    """Images of one camera.
+    """Images of one camera."""
 
-    Attributes:
-        color: (H, W, 3) float32 in 0..255, lit but without shadows.
-        depth: (H, W) float32, distance along the viewing direction, m; inf where nothing is.
-        slots: (H, W) int64, the slot of the visible object, -1 where nothing is.
-        view: (4, 4) world to camera (x right, y up, z backward).
-        focal: (2,) focal lengths, in half image widths and heights.
-    """
-
-    color: NDArray[np.float32]
-    depth: NDArray[np.float32]
-    slots: NDArray[np.int64]
-    view: NDArray[np.float64]
-    focal: NDArray[np.float64]
+    color: NDArray[np.float32]  # (H, W, 3) float32 in 0..255, lit but without shadows
+    depth: NDArray[np.float32]  # (H, W) float32, distance along the viewing direction, m; inf without an object
+    slots: NDArray[np.int64]  # (H, W) int64, slot of the visible object; -1 without one
+    view: NDArray[np.float64]  # (4, 4) transform from world to camera (x right, y up, z backward)
+    focal: NDArray[np.float64]  # (2,) focal lengths, in half image widths and heights
 
 
 def load_pybullet() -> ModuleType:
@@ -52,11 +44,7 @@ def load_pybullet() -> ModuleType:
 
 
 class Stage:
-    """Bodies of the assets ``names``, made on demand and kept; between pictures they only change their poses.
-
-    Args:
-        names: asset names in category order.
-    """
+    """Bodies of the assets ``names``, in category order, made on first use; pictures only change their poses."""
 
     def __init__(self, names: tuple[str, ...], folders: tuple[str, ...] = ()) -> None:
         self._bullet = load_pybullet()
@@ -68,7 +56,7 @@ class Stage:
         atexit.register(self.close)
 
     def close(self) -> None:
-        """Disconnect; the stage draws no more."""
+        """Disconnect from PyBullet."""
         if self._client >= 0 and self._bullet.isConnected(self._client):
             self._bullet.disconnect(self._client)
         self._client = -1
@@ -76,12 +64,12 @@ class Stage:
     def place(
         self, translations: NDArray[np.float64], quaternions: NDArray[np.float64], categories: NDArray[np.int64]
     ) -> None:
-        """Move bodies to the objects of one scene and everything else out of sight.
+        """Move bodies to the objects of one scene, and all others out of sight.
 
         Args:
-            translations: (N, 3) m.
-            quaternions: (N, 4) as (w, x, y, z).
-            categories: (N,); indices outside the library are empty slots.
+            translations: (N, 3) translations, m.
+            quaternions: (N, 4) quaternions (w, x, y, z).
+            categories: (N,) categories; indices outside the library are empty slots.
         """
         bullet, used = self._bullet, [0] * len(self._bodies)
         highest = max((body for bodies in self._bodies for body in bodies), default=-1)
@@ -131,7 +119,7 @@ class Stage:
         )
 
     def _load_palette(self) -> tuple[NDArray[np.int64], int]:
-        """All colours of the library in one texture; TinyRenderer knows textures but no vertex colours."""
+        """All colours of the library in one texture, because TinyRenderer draws no vertex colours."""
         from PIL import Image
 
         palette, self._mask = make_palette(np.concatenate([_color_codes(asset) for asset in self._library]), _CELLS**2)
@@ -180,7 +168,7 @@ def get_stage(names: tuple[str, ...], folders: tuple[str, ...] = ()) -> Stage:
 
 
 def make_palette(codes: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], int]:
-    """The colours (0xRRGGBB, sorted) that stand for ``codes``, at most ``limit``, and the mask of the bits they keep.
+    """At most ``limit`` colours (0xRRGGBB, sorted) that replace ``codes``, and the mask of the bits they keep.
 
     Colours are exact as long as they fit. If there are more (in scans), the lowest bits of each channel are dropped.
     """

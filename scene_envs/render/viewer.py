@@ -26,7 +26,7 @@ _WEB = "scene_envs.render.web"
 _SCRIPTS = ("math.js", "decode.js", "shaders.js", "targets.js", "renderer.js", "controls.js", "app.js")
 _FOV = 28.0
 _STEPS = 65535
-"""Positions of vertices are whole numbers up to this in the bounding box of their mesh."""
+"""Largest coordinate of vertices, which are whole numbers in the bounding box of their mesh."""
 _CONTACT, _TABLE = 0.05, 0.68
 """Reach (m) of contact shading, ``_CONTACT``, in a framing of radius ``_TABLE`` (m)."""
 
@@ -47,10 +47,10 @@ def write_viewer(
 
     Args:
         batch: B scenes, at least one.
-        path: the file to write; its folder is made.
-        captions: one line per scene; the number of objects by default.
-        title: heading of the page; the name of the scene type by default.
-        refresh: seconds after which the page reads its file again, for a file that is still being written; None for
+        path: File to write; its folder is made.
+        captions: One line per scene; the number of objects by default.
+        title: Heading of the page; the name of the scene type by default.
+        refresh: Seconds after which the page reads its file again, for a file that is still being written; None for
             never.
 
     Returns:

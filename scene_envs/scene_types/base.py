@@ -1,4 +1,4 @@
-"""Scene type: assets, workspace, fixed objects and camera. Pure data, no torch."""
+"""Scene type: assets, workspace, fixed objects and camera, as pure data."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class Camera:
     """A pinhole camera in the world frame.
 
     Attributes:
-        position: (x, y, z) in m.
-        target: point looked at, m.
-        up: up direction.
-        width: image width, pixels.
-        height: image height, pixels.
-        fov_y: vertical field of view, degrees.
+        position: Position (x, y, z), m.
+        target: Point in the middle of the image, m.
+        up: Direction that points up in the image.
+        width: Image width, pixels.
+        height: Image height, pixels.
+        fov_y: Vertical field of view, degrees.
     """
 
     position: tuple[float, float, float]
@@ -42,7 +42,7 @@ class FixedObject:
     """A welded asset with one constant pose (translation in m, rotation matrix row-major).
 
     Raises:
-        InvalidInputError: not three and nine numbers.
+        InvalidInputError: the pose is not three and nine numbers.
     """
 
     asset: str
@@ -62,16 +62,16 @@ class SceneType:
     """Assets, workspace, welded assets and camera under one name.
 
     Attributes:
-        name: registry key, such as ``"dimsum_table"``.
-        assets: asset names; the index of a name is its category, ``len(assets)`` is *empty*.
-        slots: rows of a scene, welded objects included.
-        workspace: lowest and highest corner (m) inside which object frames must lie.
-        welded: names of assets that are never simulated as free.
-        fixed: welded objects with one constant pose; they take the first slots of a scene, and priors put their assets
+        name: Registry key, such as ``"dimsum_table"``.
+        assets: Asset names; the index of a name is its category, ``len(assets)`` is *empty*.
+        slots: Number of rows of a scene, welded objects included.
+        workspace: Lowest and highest corner (m) of the box in which object frames must lie.
+        welded: Names of assets that are never simulated as free.
+        fixed: Welded objects with one constant pose; they take the first slots of a scene, and priors put their assets
             in no other slot.
-        camera: the paper's semantic-render camera.
-        description: one sentence for listings.
-        asset_folders: folders of users' own assets, searched before the built-in ones.
+        camera: The paper's semantic-render camera.
+        description: One sentence for listings.
+        asset_folders: Folders of users' own assets, searched before the built-in ones.
 
     Raises:
         InvalidInputError: an asset named twice, a welded asset that is not among the assets, a workspace whose corners
@@ -138,7 +138,7 @@ class SceneType:
 
     @property
     def furniture_categories(self) -> tuple[int, ...]:
-        """Categories of welded assets that no fixed object is made of, and that are therefore generated."""
+        """Categories of generated welded assets, which are those without a fixed object."""
         return tuple(sorted(set(self.welded_categories) - set(self.fixed_categories)))
 
     @property

@@ -1,4 +1,4 @@
-"""The scene types that come with SceneEnvs: their assets, workspaces and cameras."""
+"""Built-in scene types: their assets, workspaces and cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Registry of scene types: built-in ones, those of installed packages, yours, and unions of them."""
+"""Registry of scene types: built-in ones, those of installed packages, users' own, and unions of them."""
 
 from __future__ import annotations
 
@@ -55,12 +55,11 @@ def union_scene_type(types: Sequence[str | SceneType], name: str | None = None) 
 
     The union has the assets of all types, sorted by name, the largest number of slots, and the box around all
     workspaces. Assets that are welded in one type are welded in the union. Its folders of users' assets are those of
-    all types. Only objects that are fixed in the same pose in *every* type stay fixed; the others are objects like any
-    other, in any slot.
+    all types. Only objects that are fixed in the same pose in *every* type stay fixed; the others may be in any slot.
 
     Args:
-        types: at least one scene type or name.
-        name: of the union. None joins the names of the types by ``+``, and :func:`get_scene_type` knows such a name.
+        types: One or more scene types or names.
+        name: Name of the union. None joins the names of the types by ``+``, which :func:`get_scene_type` resolves.
             Another name is not registered: files that hold it need
             :func:`~scene_envs.scene_types.register_scene_type`.
 

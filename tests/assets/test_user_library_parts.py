@@ -16,8 +16,8 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.assets import Asset, ConvexPart, import_report, load_library
 from scene_envs.assets.importing import decomposition
-from scene_envs.assets.importing.decomposition import cache_folder, drawn_to
-from scene_envs.assets.importing.hulls import MOST_CORNERS, enclosing_hull, few_cornered_hull, thickness
+from scene_envs.assets.importing.decomposition import cache_folder, snap_to_surface
+from scene_envs.assets.importing.hulls import MAX_CORNERS, enclosing_hull, few_cornered_hull, thickness
 from scene_envs.assets.shapes import box, convex_hull
 from scene_envs.errors import MissingDependencyError
 
@@ -170,13 +170,13 @@ def test_an_almost_convex_mesh_is_its_hull(tmp_path: Path) -> None:
     dented.vertices[0] *= 0.985  # 0.75 mm
     asset = load(tmp_path, dented)
     assert len(asset.fine) == 1
-    assert len(asset.fine[0].vertices) <= MOST_CORNERS
+    assert len(asset.fine[0].vertices) <= MAX_CORNERS
 
 
 def test_a_hull_of_few_corners_is_close_and_inside() -> None:
     cloud = trimesh.creation.cylinder(0.05, 0.1, sections=400).vertices
     part, outside = few_cornered_hull(np.asarray(cloud), 5e-4)
-    assert len(part.vertices) <= MOST_CORNERS
+    assert len(part.vertices) <= MAX_CORNERS
     assert outside <= 5e-4
     planes = ConvexHull(part.vertices).equations
     assert (cloud @ planes[:, :3].T + planes[:, 3]).max() == pytest.approx(outside, abs=1e-12)
@@ -191,7 +191,7 @@ def test_the_coarse_hull_encloses_all_parts_with_few_corners() -> None:
     planes = ConvexHull(coarse.vertices).equations
     points = np.concatenate([part.vertices for part in parts])
     assert (points @ planes[:, :3].T + planes[:, 3]).max() < 1e-7
-    assert len(coarse.vertices) <= 2 * MOST_CORNERS
+    assert len(coarse.vertices) <= 2 * MAX_CORNERS
     assert coarse.bounds == pytest.approx(np.stack([points.min(axis=0), points.max(axis=0)]))
     assert ConvexHull(coarse.vertices).volume < 1.6 * ConvexHull(points).volume
 
@@ -214,5 +214,5 @@ def test_corners_near_the_surface_are_drawn_onto_it() -> None:
     """A cube of 0.2: corners of pieces a millimetre off its faces come back, one deep inside stays."""
     cube = trimesh.creation.box((0.2, 0.2, 0.2))
     points = np.array([[0.03, 0.02, -0.101], [0.099, 0.05, 0.0], [0.101, 0.101, 0.101], [0.0, 0.0, 0.0]])
-    drawn = drawn_to(cube, points, 0.003)
-    assert drawn == pytest.approx(np.array([[0.03, 0.02, -0.1], [0.1, 0.05, 0.0], [0.1, 0.1, 0.1], [0.0, 0.0, 0.0]]))
+    snapped = snap_to_surface(points, cube, 0.003)
+    assert snapped == pytest.approx(np.array([[0.03, 0.02, -0.1], [0.1, 0.05, 0.0], [0.1, 0.1, 0.1], [0.0, 0.0, 0.0]]))

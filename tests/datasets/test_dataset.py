@@ -132,7 +132,7 @@ def test_a_dataset_that_lost_scenes_says_so(
     assert len(SceneDataset.load(folder, limit=1)) == 1
     assert not caplog.text
     assert not SceneDataset.load(folder).complete
-    assert f"holds {len(dataset) - 1} of the {len(dataset)} scenes" in caplog.text
+    assert f"holds {len(dataset) - 1} of the {len(dataset)} requested scenes" in caplog.text
 
 
 def test_a_missing_column_is_named(folder: Path) -> None:

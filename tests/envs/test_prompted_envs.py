@@ -221,7 +221,7 @@ def test_search_refuses_what_it_cannot_follow(reader, prior):
         gym.make(SEARCH, prior=reader, guidance=1.0)
     with pytest.raises(InvalidInputError, match=r"claim_guidance=2 guides scenes .* prompt=None has none"):
         gym.make(SEARCH, prior=reader, claim_guidance=2.0)
-    with pytest.raises(InvalidInputError, match="claim_guidance=-1 must be a finite number from 0 on"):
+    with pytest.raises(InvalidInputError, match="claim_guidance=-1 must be a finite number of at least 0"):
         gym.make(SEARCH, prior=reader, prompt=PROMPTS[0], claim_guidance=-1)
     with pytest.raises(InvalidInputError, match="physics_guidance=2 must be a number from 0 to 1"):
         gym.make(SEARCH, prior=reader, physics_guidance=2)

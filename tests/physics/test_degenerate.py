@@ -14,7 +14,7 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
 from scene_envs.physics.batches import run_kernel, spent, stack
-from scene_envs.physics.budget import LEAST, MOST_PER_OBJECT, PER_OBJECT, PER_PAIR, PER_SCENE
+from scene_envs.physics.budget import MAX_PER_OBJECT, MIN_UNITS, PER_OBJECT, PER_PAIR, PER_SCENE
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
 from scene_envs.scene_types.built_in import BUILT_IN
@@ -165,7 +165,7 @@ def test_search_goes_on_from_a_degenerate_scene() -> None:
 
 
 @pytest.mark.parametrize(
-    ("objects", "units"), [(1, MOST_PER_OBJECT), (2, LEAST), (5, LEAST), (8, 8 * PER_OBJECT + 28 * PER_PAIR)]
+    ("objects", "units"), [(1, MAX_PER_OBJECT), (2, MIN_UNITS), (5, MIN_UNITS), (8, 8 * PER_OBJECT + 28 * PER_PAIR)]
 )
 def test_scenes_of_few_objects_may_take_as_many_units_as_larger_ones(objects: int, units: float) -> None:
     dimsum = get_grammar("dimsum_table").sample(np.random.default_rng(0), 1)

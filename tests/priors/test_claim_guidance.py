@@ -234,7 +234,7 @@ def test_guidance_of_zero_changes_no_bit_and_kept_entries_stay() -> None:
 
 @pytest.mark.parametrize("strength", [-1.0, math.nan, math.inf])
 def test_a_strength_below_zero_or_not_finite_is_refused(strength: float) -> None:
-    with pytest.raises(InvalidInputError, match=r"claim_guidance=.*from 0 on"):
+    with pytest.raises(InvalidInputError, match=r"claim_guidance=.*of at least 0"):
         tiny_prior(process="mixed", text=True).sample(1, prompt="A scene.", claim_guidance=strength, num_steps=2)
 
 

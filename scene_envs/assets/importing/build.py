@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _CONVEX = 0.01
 """Depth below the hull, as a fraction of the diagonal, up to which a body counts as convex."""
-_MOST_CONVEX = 2e-3
+_MAX_CONVEX = 2e-3
 """Upper limit (m) of that depth."""
 _THIN = 3e-3
 """Parts thinner than this (m) get a note: the collision margins of physics engines take up much of them."""
@@ -106,7 +106,7 @@ def _read(path: Path) -> Model:
 
 
 def _scaled(model: Model, entry: AssetEntry) -> Model:
-    """The model scaled, with its up axis turned to +z; the density stays, so mass goes with the cube of the scale."""
+    """The model scaled, with its up axis turned to +z; the density is kept, so the mass grows with the scale cubed."""
     turn, scale = _upright(entry.up), entry.scale
 
     def shape(old: Shape) -> Shape:
@@ -155,7 +155,7 @@ def _collide(
     shapes: Sequence[Shape], entry: AssetEntry, size: float, path: Path, notes: list[str], warnings: list[str]
 ) -> tuple[list[ConvexPart], float]:
     """Fine parts of all shapes and the volume (m^3) they fill; adds remarks to ``notes`` and ``warnings``."""
-    tolerance = min(_CONVEX * size, _MOST_CONVEX)
+    tolerance = min(_CONVEX * size, _MAX_CONVEX)
     parts: list[ConvexPart] = []
     volume, repeated = 0.0, 0
     seen: set[bytes] = set()
@@ -189,7 +189,7 @@ def _unlike(visual: trimesh.Trimesh, parts: Sequence[ConvexPart], size: float) -
     apart = float(np.abs(np.asarray(visual.bounds) - bounds_of(parts)).max())
     if apart <= max(_UNLIKE, 0.05 * size):
         return []
-    return [f"what is seen reaches up to {apart:.2g} m beyond what collides, or the other way round"]
+    return [f"the boxes of visual and collision geometry differ by up to {apart:.2g} m"]
 
 
 def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trimesh | None) -> Array:

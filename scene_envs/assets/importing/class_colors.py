@@ -20,7 +20,7 @@ def _candidates() -> NDArray[np.float64]:
 
 
 def distinct_colors(count: int, taken: Iterable[Color] = ()) -> list[Color]:
-    """``count`` colours, each the candidate farthest from white and from all before it; always the same ones.
+    """``count`` colours, each the candidate farthest from white and from all before it; the choice is deterministic.
 
     >>> colors = np.array(distinct_colors(20), dtype=float)
     >>> gaps = np.linalg.norm(colors[:, None] - colors[None], axis=-1) + 1e3 * np.eye(20)

@@ -20,7 +20,7 @@ import numpy as np
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import ConvexPart
-from scene_envs.assets.importing.hulls import MOST_CORNERS, concavity, few_cornered_hull, has_volume
+from scene_envs.assets.importing.hulls import MAX_CORNERS, concavity, few_cornered_hull, has_volume
 from scene_envs.assets.importing.limits import seconds_left, too_slow
 from scene_envs.assets.importing.mesh_files import bare
 from scene_envs.errors import InvalidInputError, MissingDependencyError
@@ -35,11 +35,11 @@ METHODS: tuple[Method, ...] = ("auto", "coacd", "convex")
 _LOGGER = logging.getLogger(__name__)
 _VERSION = 2
 """Version of the format on disk."""
-_DRAWN = 0.015
-"""Distance from the true surface, relative to the size of the body, up to which corners are moved back onto it. CoACD
+_SNAP_DISTANCE = 0.015
+"""Largest distance from the true surface, relative to the size of the body, at which corners are moved onto it. CoACD
 rebuilds surfaces that are not closed on a grid; moving the corners keeps flat faces flat."""
-_MOST_BODIES = 128
-"""Largest number of bodies of one mesh that are handled one by one."""
+_MAX_BODIES = 128
+"""Largest number of bodies of one mesh that are decomposed one by one."""
 
 
 def cache_folder() -> Path:
@@ -60,15 +60,15 @@ def convex_parts(
     that is not closed is decomposed as a whole.
 
     Args:
-        mesh: triangles, m.
-        method: ``"convex"`` takes one hull of everything; ``"coacd"`` insists on CoACD where a body is concave;
+        mesh: Triangles, m.
+        method: ``"convex"`` takes one hull of the whole mesh; ``"coacd"`` requires CoACD where a body is concave;
             ``"auto"`` falls back to a hull where CoACD is not installed.
-        tolerance: m; a body nowhere deeper than this below its hull is convex.
+        tolerance: Largest depth below its hull (m) of a body that counts as convex.
         threshold: CoACD's concavity, relative to the size of the body.
-        what: name of the mesh, for messages.
+        what: Name of the mesh, for messages.
 
     Returns:
-        parts, notes and warnings; no parts when the mesh spans no volume.
+        Parts, notes and warnings; no parts when the mesh spans no volume.
 
     Raises:
         MissingDependencyError: ``"coacd"`` without the package.
@@ -104,7 +104,7 @@ def _bodies(surface: trimesh.Trimesh, tolerance: float) -> tuple[list[trimesh.Tr
     """Closed or convex bodies of a surface and the number of flat pieces; else the whole surface as one body."""
     pieces: list[Any] = list(surface.split(only_watertight=False))
     solid = [piece for piece in pieces if has_volume(np.asarray(piece.vertices))]
-    if not solid or len(solid) > _MOST_BODIES:
+    if not solid or len(solid) > _MAX_BODIES:
         return [surface], 0
     for piece in solid:
         closed = piece.is_watertight and piece.volume > 0
@@ -137,7 +137,7 @@ def _decompose(body: trimesh.Trimesh, method: Method, threshold: float, what: st
     _LOGGER.info("decomposing %s (%d triangles); the result is kept in %s", what, len(body.faces), path.parent)
     size = float(body.scale)  # CoACD's numerics want a size near 1
     found = run_coacd(np.asarray(body.vertices) / size, np.asarray(body.faces), settings, what)
-    pieces = [drawn_to(body, vertices * size, _DRAWN * size) for vertices in found]
+    pieces = [snap_to_surface(vertices * size, body, _SNAP_DISTANCE * size) for vertices in found]
     pieces = [piece for piece in pieces if has_volume(piece)]
     if not pieces:
         raise InvalidInputError(f"CoACD found no convex parts in {what}; set `decomposition: convex` for it")
@@ -155,7 +155,7 @@ def coacd_settings(threshold: float) -> dict[str, Any]:
         "mcts_nodes": 10,
         "mcts_iterations": 30,
         "mcts_max_depth": 2,
-        "max_ch_vertex": MOST_CORNERS,
+        "max_ch_vertex": MAX_CORNERS,
         "decimate": True,
         "seed": 0,
     }
@@ -164,18 +164,18 @@ def coacd_settings(threshold: float) -> dict[str, Any]:
 def _has_coacd() -> bool:
     try:
         return find_spec("coacd") is not None
-    except ValueError:  # the module was replaced by one without a spec
+    except ValueError:  # a module without a spec
         return False
 
 
 def run_coacd(vertices: Array, faces: Array, settings: dict[str, Any], what: str) -> list[Array]:
-    """Corners (P, 3) of the convex pieces, from a process that is ended when the time of the import is over.
+    """Corners (P, 3) of the convex pieces, from a process that is ended at the time limit of the import.
 
     Args:
-        vertices: (V, 3).
-        faces: (F, 3) int.
-        settings: keywords of ``coacd.run_coacd``.
-        what: name of the mesh, for messages.
+        vertices: (V, 3) corners of the mesh.
+        faces: (F, 3) int, rows of ``vertices``.
+        settings: Keywords of ``coacd.run_coacd``.
+        what: Name of the mesh, for messages.
 
     Raises:
         InvalidInputError: CoACD took too long, or failed.
@@ -202,25 +202,22 @@ def coacd_pieces(request: tuple[Array, Array, dict[str, Any]]) -> list[Array]:
     return found
 
 
-def drawn_to(body: trimesh.Trimesh, points: Array, reach: float) -> Array:
-    """The points (P, 3), those within ``reach`` (m) of the surface moved to the nearest point on it."""
+def snap_to_surface(points: Array, body: trimesh.Trimesh, max_distance: float) -> Array:
+    """The points (P, 3), with those within ``max_distance`` (m) of the surface moved to the nearest point on it."""
     from trimesh.triangles import closest_point
 
     triangles = np.asarray(body.triangles)
-    low, high = triangles.min(axis=1) - reach, triangles.max(axis=1) + reach
-    drawn = points.copy()
+    low, high = triangles.min(axis=1) - max_distance, triangles.max(axis=1) + max_distance
+    snapped = points.copy()
     for index, point in enumerate(points):
         near = triangles[((point >= low) & (point <= high)).all(axis=1)]
         if not len(near):
             continue
         on_surface = closest_point(near, np.tile(point, (len(near), 1)))
         distance = np.linalg.norm(on_surface - point, axis=1)
-        if distance.min() <= reach:
-            drawn[index] = on_surface[distance.argmin()]
-    return drawn
-
-
-# -- the cache ------------------------------------------------------------------------------------
+        if distance.min() <= max_distance:
+            snapped[index] = on_surface[distance.argmin()]
+    return snapped
 
 
 def _key(body: trimesh.Trimesh, settings: dict[str, Any]) -> str:
@@ -232,7 +229,7 @@ def _key(body: trimesh.Trimesh, settings: dict[str, Any]) -> str:
 
 
 def _read(path: Path) -> list[Array] | None:
-    """The pieces in a cache file; None when there is none, or one that is damaged (which is then made anew)."""
+    """The pieces in a cache file; None when the file is missing or damaged."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:
             vertices, counts = np.asarray(stored["vertices"]), np.asarray(stored["counts"])

@@ -1,4 +1,4 @@
-"""``library.yaml``: a user's settings for the files of a folder."""
+"""Reader of ``library.yaml``, a user's settings for the files of a folder."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class AssetNames:
     """File and names of an asset.
 
     Attributes:
-        file: path relative to the folder.
-        name: identifier; the stem of the file by default.
-        display_name: what prompts call it; the name with spaces by default.
-        plural: plural of the display name; the regular one by default.
+        file: Path relative to the folder.
+        name: Identifier; the stem of the file by default.
+        display_name: Name in prompts; the identifier with spaces by default.
+        plural: Plural of the display name; the regular one by default.
     """
 
     file: str
@@ -46,12 +46,12 @@ class AssetEntry(AssetNames):
     """One asset of a library: its names and how its file becomes a body.
 
     Attributes:
-        scale: factor on all lengths; a file in millimetres needs 0.001.
-        density: kg/m^3; fills the shape evenly.
-        mass: kg.
-        welded: whether the asset is fixed to the world; by default as the file says.
-        up: axis of the file that points up.
-        color: (r, g, b) class colour, also used for surfaces without a colour.
+        scale: Factor on all lengths; a file in millimetres needs 0.001.
+        density: Density (kg/m^3) of the evenly filled shape.
+        mass: Mass, kg.
+        welded: Whether the asset is fixed to the world; the file decides by default.
+        up: Axis of the file that points up.
+        color: Class colour (r, g, b), also used for surfaces without a colour.
         base: ``"bottom"`` puts the frame under the middle of the bounding box, ``"origin"`` leaves it.
         decomposition: ``"auto"``, ``"coacd"`` or ``"convex"``; see :func:`convex_parts`.
         concavity: CoACD's threshold, 0.01 (many parts) to 1 (one).

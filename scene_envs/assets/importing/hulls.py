@@ -11,7 +11,7 @@ from scene_envs.arrays import Array
 from scene_envs.assets.base import ConvexPart
 from scene_envs.assets.shapes import convex_hull
 
-MOST_CORNERS = 64
+MAX_CORNERS = 64
 """Largest number of corners of a hull; the cost of collision tests grows in proportion."""
 _COARSE_CORNERS = 16
 """Corners of the inner hull whose faces are moved outward to make an enclosing hull."""
@@ -19,7 +19,7 @@ _DIRECTIONS = np.array(list(np.ndindex(3, 3, 3)), dtype=np.float64) - 1.0
 """Directions to the 26 neighbours of a cell, and the zero vector."""
 
 
-def few_cornered_hull(points: Array, tolerance: float, corners: int = MOST_CORNERS) -> tuple[ConvexPart, float]:
+def few_cornered_hull(points: Array, tolerance: float, corners: int = MAX_CORNERS) -> tuple[ConvexPart, float]:
     """A hull of some of the points (P, 3), and the farthest distance (m) of a point outside it.
 
     Starts from the extreme points and adds the farthest outlier until all are within ``tolerance`` (m) or
@@ -64,7 +64,7 @@ def enclosing_hull(parts: Sequence[ConvexPart]) -> ConvexPart:
     """One convex part that encloses all parts, with few faces; the exact hull when that has few corners."""
     points = np.concatenate([part.vertices for part in parts])
     exact = convex_hull(points)
-    if len(exact.vertices) <= MOST_CORNERS:
+    if len(exact.vertices) <= MAX_CORNERS:
         return exact
     inner, _ = few_cornered_hull(points, 0.0, _COARSE_CORNERS)
     normals = np.concatenate([ConvexHull(inner.vertices).equations[:, :3], np.eye(3), -np.eye(3)])

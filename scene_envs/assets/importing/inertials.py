@@ -13,7 +13,7 @@ from scene_envs.assets.importing.model import Inertial
 from scene_envs.assets.shapes import MassProperties, mass_properties
 
 DEFAULT_DENSITY = 500.0
-"""kg/m^3, used where neither the file nor the user gives one: wood, or a ceramic vessel with the air in it."""
+"""Density (kg/m^3) used where neither the file nor the user gives one: wood, or a ceramic vessel with its air."""
 _POSSIBLE = (1.0, 23_000.0)
 """Possible densities, kg/m^3, from air to osmium."""
 _FACTOR = 10.0
@@ -42,11 +42,11 @@ def weigh(
     file's distribution of mass; a user's ``density`` fills the shape evenly.
 
     Args:
-        given: what the file says; None when it says nothing.
-        parts: fine convex parts, m.
-        volume: m^3 that the shape fills.
-        mass: kg, from the user.
-        density: kg/m^3, from the user.
+        given: Inertial of the file; None when the file has none.
+        parts: Fine convex parts, m.
+        volume: Volume of the shape, m^3.
+        mass: The user's mass, kg.
+        density: The user's density, kg/m^3.
     """
     if density is not None:
         return Weight(mass_properties(parts, density * volume), (), ())
@@ -77,7 +77,7 @@ def weigh(
 
 
 def why_impossible(inertia: Array, center: Array, parts: Sequence[ConvexPart], computed: MassProperties) -> str:
-    """Reason why a body of this shape cannot have this inertia (3, 3) and centre of mass (3,); empty if it can.
+    """Reason why a body of this shape cannot have this inertia (3, 3) and centre of mass (3,); empty if possible.
 
     >>> from scene_envs.assets.shapes import box
     >>> cube = [box((0.1, 0.1, 0.1))]

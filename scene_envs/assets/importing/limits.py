@@ -22,37 +22,27 @@ from scene_envs.errors import InvalidInputError
 Result = TypeVar("Result")
 _PREFIX = "SCENE_ENVS_IMPORT_"
 _GRACE = 1.0
-"""Seconds beyond the limit for work that checks the time itself."""
+"""Additional seconds for work that checks the time itself."""
 _HEAD = 1 << 16
-"""Bytes at the start of a mesh file in which its header is looked for."""
+"""Number of bytes at the start of a mesh file that are searched for its header."""
 READ_HERE = 300_000
-"""Largest number of bytes of files that are imported in the calling process. The import runs in a thread that is
-abandoned when the time is over. A larger import runs in a process of its own, which is ended when the time is over."""
+"""Largest number of bytes of files that are imported in the calling process, by a thread that is abandoned at the time
+limit. A larger import runs in a process of its own, which is ended at the time limit."""
 _BYTES_PER_TRIANGLE = 36
 
 
 class LargeImportError(BaseException):
-    """An import reads more than :data:`READ_HERE`.
-
-    This is a BaseException, so that no code takes it for an error of the file.
-    """
+    """An import reads more than :data:`READ_HERE`; no Exception, so that it is not taken for an error of the file."""
 
 
 @dataclass
 class _Clock:
-    """The import of one asset.
+    """The import of one asset."""
 
-    Attributes:
-        path: file of the asset.
-        end: time of the monotonic clock at which the import must be done.
-        seconds: time that the import was given.
-        room: bytes of files that the import may still read in this process.
-    """
-
-    path: Path
-    end: float
-    seconds: float
-    room: float
+    path: Path  # file of the asset
+    end: float  # time of the monotonic clock at which the import must be done
+    seconds: float  # time limit of the import
+    room: float  # bytes of files that the import may still read in this process
 
 
 _clock: ContextVar[_Clock | None] = ContextVar("import_clock", default=None)
@@ -63,12 +53,13 @@ class ImportLimits:
     """Limits for each file of a user's assets.
 
     The environment variables ``SCENE_ENVS_IMPORT_MEGABYTES``, ``SCENE_ENVS_IMPORT_TRIANGLES`` and
-    ``SCENE_ENVS_IMPORT_SECONDS`` replace the defaults. The folder cannot, because it may come from someone else.
+    ``SCENE_ENVS_IMPORT_SECONDS`` replace the defaults. The folder cannot set them, because its source may be
+    untrusted.
 
     Attributes:
-        megabytes: size of a file, 10⁶ bytes.
-        triangles: triangles (or corners) of a mesh file, as its header or its content says.
-        seconds: time for reading, decomposing and weighing one asset; a longer import is not waited for.
+        megabytes: Size of a file, 10⁶ bytes.
+        triangles: Number of triangles (or corners) of a mesh file, from its header or its content.
+        seconds: Time for reading, decomposing and weighing one asset; a longer import is abandoned.
     """
 
     megabytes: float = 256.0
@@ -97,47 +88,45 @@ class ImportLimits:
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file that is larger, or whose header promises more triangles, than the limits.
+    """Refuse a file that is larger, or whose header states more triangles, than the limits.
 
     Raises:
-        InvalidInputError: the file is beyond a limit; names the file, the limit and the variable that raises the limit.
+        InvalidInputError: the file exceeds a limit; the message names the file, the limit and its variable.
         LargeImportError: the running import must move to a process of its own.
     """
     limits = ImportLimits.current()
     try:
         size = path.stat().st_size
     except OSError:
-        return  # whoever reads it says why it cannot be read
+        return  # the reader of the file raises the error
     if size > limits.megabytes * 1e6:
         raise InvalidInputError(
             f"{path} has {size / 1e6:,.0f} MB, more than the {limits.megabytes:g} MB that one file of an asset may "
             f"have; simplify it, or set {_PREFIX}MEGABYTES"
         )
-    promised = _promised(path, size)
-    check_triangles(path, promised)
+    stated = _stated_triangles(path, size)
+    check_triangles(path, stated)
     if (clock := _clock.get()) is not None:
-        clock.room -= max(size, _BYTES_PER_TRIANGLE * promised)
+        clock.room -= max(size, _BYTES_PER_TRIANGLE * stated)
         if clock.room < 0:
             raise LargeImportError
 
 
 def check_triangles(path: Path, count: int) -> None:
-    """Refuse ``count`` triangles if they are too many; raises as :func:`check_file` does."""
-    most = ImportLimits.current().triangles
-    if count > most:
+    """Refuse a file of too many triangles; raises as :func:`check_file` does."""
+    limit = ImportLimits.current().triangles
+    if count > limit:
         raise InvalidInputError(
-            f"{path} has {count:,} triangles, more than the {most:,.0f} that one mesh file may have; simplify it, or "
+            f"{path} has {count:,} triangles, more than the {limit:,.0f} that one mesh file may have; simplify it, or "
             f"set {_PREFIX}TRIANGLES"
         )
 
 
 @contextmanager
 def timed(path: Path, room: float = math.inf) -> Iterator[None]:
-    """Context in which the time of the import of one asset runs; :func:`seconds_left` tells how much is left.
+    """Context in which the time of the import of the asset at ``path`` runs; see :func:`seconds_left`.
 
-    Args:
-        path: file of the asset.
-        room: bytes of files beyond which :func:`check_file` raises LargeImportError.
+    :func:`check_file` raises LargeImportError for files of more than ``room`` bytes together.
     """
     seconds = ImportLimits.current().seconds
     token = _clock.set(_Clock(path, time.monotonic() + seconds, seconds, room))
@@ -151,7 +140,7 @@ def seconds_left() -> float | None:
     """Seconds until the running import has to be done; None when no import runs.
 
     Raises:
-        InvalidInputError: none are left.
+        InvalidInputError: the time is over.
     """
     clock = _clock.get()
     if clock is None:
@@ -163,14 +152,12 @@ def seconds_left() -> float | None:
 
 
 def in_time(work: Callable[[], Result]) -> Result:
-    """The result of ``work``, if it comes before the running import has to be done.
+    """The result of ``work``, if it is done before the time limit of the running import.
 
     Work that takes longer goes on in a thread of its own, which ends at the next :func:`seconds_left`. Work that
-    checks the time itself, such as that of CoACD, gets one more second, in which it can say what took so long.
+    checks the time itself, such as that of CoACD, gets one more second, in which it can report the slow step.
 
-    Raises:
-        InvalidInputError: the time is over.
-        BaseException: what ``work`` raises.
+    Raises InvalidInputError when the time is over, and the exceptions of ``work``.
     """
     outcome: Future[Result] = Future()
     context = copy_context()
@@ -189,7 +176,7 @@ def in_time(work: Callable[[], Result]) -> Result:
 
 
 def too_slow(doing: str) -> InvalidInputError:
-    """The error for an import that took too long, ``doing`` something at the end."""
+    """The error for an import that took too long; ``doing`` names its last step."""
     clock = _clock.get()
     path = Path("the mesh") if clock is None else clock.path
     seconds = ImportLimits.current().seconds if clock is None else clock.seconds
@@ -199,8 +186,8 @@ def too_slow(doing: str) -> InvalidInputError:
     )
 
 
-def _promised(path: Path, size: int) -> int:
-    """The number of triangles or corners that the header of a mesh file states, 0 where it states none."""
+def _stated_triangles(path: Path, size: int) -> int:
+    """Number of triangles or corners that the header of a mesh file states, 0 without one."""
     suffix = path.suffix.lower()
     try:
         with path.open("rb") as file:
@@ -245,4 +232,4 @@ def _gltf_count(path: Path, head: bytes) -> int:
         accessors = json.loads(text)["accessors"]
         return max((int(accessor["count"]) for accessor in accessors), default=0) // 3
     except (ValueError, KeyError, TypeError, RecursionError):
-        return 0  # whoever reads it says what is wrong
+        return 0  # the reader of the file raises the error

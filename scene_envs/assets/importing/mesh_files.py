@@ -1,4 +1,4 @@
-"""Mesh files: triangles with a colour per corner, checked."""
+"""Reader of mesh files: checked triangles with a colour per corner."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _UNSET = (102, 102, 102)
 """Colour that trimesh gives a mesh with texture coordinates and no material."""
 _SMOOTH = float(np.cos(np.radians(40.0)))
 """Faces that meet at less than 40 degrees are shaded as one curved surface."""
-_MOST_SMOOTHED = 100_000
+_MAX_SMOOTHED = 100_000
 """Largest number of triangles of a mesh whose corners are smoothed."""
 _FINE_TEXTURE, _TEXTURE_COLORS = 500, 32
-"""Least number of triangles that a textured mesh is cut into, and largest number of its colours."""
-_MOST_PIXELS = 8192 * 8192
-"""Most pixels of a texture."""
+"""Smallest number of triangles that a textured mesh is cut into, and largest number of its colours."""
+_MAX_PIXELS = 8192 * 8192
+"""Largest number of pixels of a texture."""
 _SAMPLES = np.array(
     [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)], dtype=np.float64
 ) / 4.0  # fmt: skip
@@ -117,9 +117,9 @@ def _check_texture(mesh: Any, path: Path) -> None:
     """Refuse a texture of too many pixels before it is decoded: a file of a few kB may hold a gigabyte of pixels."""
     image = _image(getattr(getattr(mesh, "visual", None), "material", None))
     width, height = getattr(image, "size", (0, 0))
-    if width * height > _MOST_PIXELS:
+    if width * height > _MAX_PIXELS:
         raise InvalidInputError(
-            f"{path} has a texture of {width:,} x {height:,} pixels, more than the {_MOST_PIXELS:,} that one may have; "
+            f"{path} has a texture of {width:,} x {height:,} pixels, more than the {_MAX_PIXELS:,} that one may have; "
             "scale it down"
         )
 
@@ -218,7 +218,7 @@ def _few_colors(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _cut(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A textured mesh of few triangles cut into more, so that the texture is seen; others as they are."""
+    """A textured mesh of few triangles cut into more, so that the texture is visible; other meshes unchanged."""
     import trimesh
 
     visual: Any = mesh.visual
@@ -242,7 +242,7 @@ def _corner_normals(mesh: trimesh.Trimesh) -> Array:
     length = np.linalg.norm(area, axis=1, keepdims=True)
     unit = np.divide(area, length, out=np.tile([0.0, 0.0, 1.0], (len(area), 1)), where=length > 0)
     flat = np.repeat(unit[:, None], 3, axis=1)
-    if len(faces) > _MOST_SMOOTHED:
+    if len(faces) > _MAX_SMOOTHED:
         return flat
     _, point = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
     point = point.reshape(-1)

@@ -19,24 +19,17 @@ Kind = Literal["mesh", "box", "cylinder", "sphere", "capsule", "ellipsoid"]
 class Shape:
     """One piece of geometry of a model.
 
-    Attributes:
-        kind: what it is.
-        size: m. Box (x, y, z), cylinder and capsule (radius, length along z without the caps), sphere (radius,),
-            ellipsoid (x, y, z radii); the scale (x, y, z) of a mesh.
-        pose: (4, 4) shape frame to model frame.
-        where: link and element, for messages.
-        path: file of a mesh.
-        color: (r, g, b) that the model gives it, or None.
-        is_convex: the model declares the mesh convex.
+    The ``size`` (m) is (x, y, z) of a box, (radius, length along z without the caps) of a cylinder or capsule,
+    (radius,) of a sphere, (x, y, z radii) of an ellipsoid; of a mesh, it is the scale (x, y, z).
     """
 
     kind: Kind
     size: tuple[float, ...]
-    pose: Array
-    where: str
-    path: Path | None = None
-    color: Color | None = None
-    is_convex: bool = False
+    pose: Array  # (4, 4) transform from the shape frame to the model frame
+    where: str  # link and element, for messages
+    path: Path | None = None  # file of a mesh
+    color: Color | None = None  # colour (r, g, b) given by the model, or None
+    is_convex: bool = False  # whether the model declares the mesh convex
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,21 +43,13 @@ class Inertial:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A model file at zero joint positions, in one frame.
+    """A model file at zero joint positions, in one frame."""
 
-    Attributes:
-        visuals: what is seen.
-        collisions: what is touched.
-        inertials: one per link that has one.
-        static: the model is fixed to the world; None when the file does not say.
-        notes: what was read differently from what the file might mean.
-    """
-
-    visuals: tuple[Shape, ...]
-    collisions: tuple[Shape, ...]
-    inertials: tuple[Inertial, ...] = ()
-    static: bool | None = None
-    notes: tuple[str, ...] = field(default=())
+    visuals: tuple[Shape, ...]  # shapes to draw
+    collisions: tuple[Shape, ...]  # shapes for collisions
+    inertials: tuple[Inertial, ...] = ()  # inertials of the links that have one
+    static: bool | None = None  # whether the model is fixed to the world; None when the file does not say
+    notes: tuple[str, ...] = field(default=())  # choices of the reader that the file may not intend
 
 
 def pose_of(translation: Array, rotation: Array) -> Array:

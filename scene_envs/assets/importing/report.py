@@ -1,4 +1,4 @@
-"""Import report: one line per asset."""
+"""Reports on the import of assets: one line per asset."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ class AssetReport:
     """Import report of one file.
 
     Attributes:
-        name: of the asset.
-        file: file that the asset was read from.
-        mass: kg; 0 for welded assets.
-        density: kg/m^3 of the solid; 0 for welded assets.
-        parts: number of fine convex parts.
-        origin: (x, y, z) m: where the origin of the file lies in the asset frame.
-        notes: what was assumed or chosen.
-        warnings: faults of the file that were corrected, or could not be.
-        error: why there is no asset; empty when there is one.
+        name: Name of the asset.
+        file: File that the asset was read from.
+        mass: Mass, kg; 0 for welded assets.
+        density: Density of the solid, kg/m^3; 0 for welded assets.
+        parts: Number of fine convex parts.
+        origin: Position (x, y, z) of the origin of the file in the asset frame, m.
+        notes: Assumptions and choices.
+        warnings: Faults of the file, corrected where possible.
+        error: Reason why there is no asset; empty when there is one.
     """
 
     name: str
@@ -45,9 +45,9 @@ class ImportReport:
     """Import report of a folder.
 
     Attributes:
-        folder: folder that was read.
-        assets: one report per file.
-        notes: about the folder as a whole.
+        folder: Folder that was read.
+        assets: One report per file.
+        notes: Notes about the folder as a whole.
     """
 
     folder: Path

@@ -81,7 +81,7 @@ class _Frames:
 
     def __init__(self, model: Element, path: Path) -> None:
         self._path = path
-        self._elements: dict[str, tuple[Element, str]] = {}  # element, and what its pose is relative to by default
+        self._elements: dict[str, tuple[Element, str]] = {}  # element, and the default base of its pose
         for link in model.findall("link"):
             self._elements[link.get("name", "")] = link, "__model__"
         for joint in model.findall("joint"):

@@ -40,7 +40,7 @@ def _file(path: Path, changed: int) -> tuple[trimesh.Trimesh, ...]:
 def meshes_of(shape: Shape) -> list[trimesh.Trimesh]:
     """The meshes of a mesh shape in the model frame, colours kept.
 
-    Raises what :func:`read_mesh` raises.
+    Raises like :func:`read_mesh`.
     """
     assert shape.path is not None
     changed = shape.path.stat().st_mtime_ns if shape.path.is_file() else 0

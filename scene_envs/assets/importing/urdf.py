@@ -26,7 +26,7 @@ _ZERO = (0.0, 0.0, 0.0)
 def read_urdf(path: Path) -> Model:
     """The model in a URDF file, in the frame of its root link.
 
-    Movable joints are frozen at zero, which a note says.
+    Movable joints are frozen at zero and listed in a note.
 
     Raises:
         CorruptFileError: not a URDF, or one that contradicts itself; the place is named.

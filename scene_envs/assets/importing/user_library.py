@@ -1,4 +1,4 @@
-"""Asset library of a folder of files."""
+"""Asset library of a folder of model files."""
 
 from __future__ import annotations
 
@@ -48,9 +48,6 @@ def load_library(folder: str | os.PathLike[str]) -> AssetLibrary:
     that cannot be read are left out. The log and :func:`import_report` list these choices and all corrections. Each
     file is read once per process.
 
-    Args:
-        folder: path of the folder.
-
     Raises:
         InvalidInputError: no such folder or no assets in it, a wrong entry, or a mesh that does not exist.
         CorruptFileError: a file that ``library.yaml`` lists cannot be read; file and reason are named.
@@ -88,19 +85,12 @@ def import_report(folder: str | os.PathLike[str]) -> ImportReport:
 
 @dataclass(frozen=True, eq=False)
 class FolderIndex:
-    """The assets that a folder offers; each is built when it is asked for.
+    """The assets of a folder; each is built on first use."""
 
-    Attributes:
-        folder: absolute path.
-        entries: in the order of the library.
-        is_listed: whether ``library.yaml`` lists them.
-        notes: what was assumed about the folder.
-    """
-
-    folder: Path
-    entries: tuple[AssetEntry, ...]
-    is_listed: bool
-    notes: tuple[str, ...]
+    folder: Path  # absolute path
+    entries: tuple[AssetEntry, ...]  # entries of the assets, in the order of the library
+    is_listed: bool  # whether ``library.yaml`` lists the assets
+    notes: tuple[str, ...]  # assumptions about the folder
 
     @property
     def names(self) -> list[str]:
@@ -108,7 +98,7 @@ class FolderIndex:
         return [entry.name for entry in self.entries]
 
     def build(self, name: str) -> Asset:
-        """The asset called ``name``; raises what :func:`load_library` raises, and UnknownNameError."""
+        """The asset called ``name``; raises like :func:`load_library`, or UnknownNameError."""
         return self._built(name)[0]
 
     def report(self, name: str) -> AssetReport:

@@ -46,7 +46,7 @@ def numbers(text: str | None, count: int, path: Path, where: str, default: tuple
     """``count`` finite numbers from text; ``default`` when there is none.
 
     Raises:
-        CorruptFileError: something else is written there; file and place are named.
+        CorruptFileError: the text is anything else; file and place are named.
     """
     if text is None or not text.strip():
         if default is None:
@@ -82,9 +82,9 @@ def color_of(text: str | None, path: Path, where: str) -> Color | None:
 
 
 def find_mesh(uri: str, path: Path, where: str) -> Path:
-    """The file that a model at ``path`` means by ``uri``: relative, absolute, file://, package:// or model://.
+    """The file that ``uri`` names in the model at ``path``: relative, absolute, file://, package:// or model://.
 
-    A package is looked for among the folders above the model, and in ``ROS_PACKAGE_PATH``.
+    A package is searched among the folders above the model, and in ``ROS_PACKAGE_PATH``.
 
     Raises:
         InvalidInputError: there is no such file; the places that were searched are named.

@@ -1,4 +1,4 @@
-"""The recipes; importing this package registers them all."""
+"""Recipes of all built-in assets, which are registered by an import of this package."""
 
 from scene_envs.assets.recipes import (
     bowls,

@@ -1,4 +1,4 @@
-"""Bowls: a flat floor and walls of two bands, hollow in both levels of detail because things lie in them."""
+"""Bowls: a flat floor and walls of two bands, hollow in both levels of detail because objects lie in them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SIDES = 12
 
 
 class _Bowl(NamedTuple):
-    """Lengths in m: outside and inside (r, z) where the bands meet, and the sizes of floor and rim."""
+    """Lengths (m): outside and inside (r, z) at the joint of the bands, and sizes of floor and rim."""
 
     foot: float
     floor: float

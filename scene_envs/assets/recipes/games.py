@@ -1,4 +1,4 @@
-"""Game boxes, lying: plain boxes that stack exactly, with printed lids."""
+"""Lying game boxes with printed lids: plain boxes that stack exactly."""
 
 from __future__ import annotations
 

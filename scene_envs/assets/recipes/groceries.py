@@ -13,7 +13,7 @@ from scene_envs.assets.surfaces import Color, join
 
 _WIDTH, _DEPTH, _HEIGHT = 0.19, 0.06, 0.28
 _PRINT = 4e-4
-"""How far (m) print lies before the board."""
+"""Distance (m) of the print in front of the board."""
 _BOARD: Color = (238, 160, 44)
 _FLAP: Color = (222, 140, 34)
 _BRAND: Color = (160, 34, 44)
@@ -25,7 +25,7 @@ _HOLE: Color = (240, 228, 204)
 
 _RINGS = ((-0.036, 0.0), (-0.019, 0.009), (-0.014, -0.007), (0.004, 0.002), (0.018, 0.010), (0.022, -0.006),
           (0.040, 0.001))  # fmt: skip
-"""Where cereal floats in the picture on the box, m from the middle of the bowl."""
+"""Positions (m, from the middle of the bowl) of the cereal in the picture on the box."""
 _LETTERS = {
     "O": ("###", "#.#", "#.#", "#.#", "###"),
     "A": ("###", "#.#", "###", "#.#", "#.#"),

@@ -39,10 +39,10 @@ def revolve(
     Args:
         profile: (P, 2) points (r, z), m, with the outside on the right, as for
             :func:`~scene_envs.assets.surfaces.lathe`.
-        colors: the colours ``paint`` chooses from.
-        paint: colour index per cell, from the angle and the height of its middle.
-        segments: cells around.
-        swell: factor on the radius from angle (rad) and height (m), for lobes and spouts.
+        colors: Colours that ``paint`` chooses from.
+        paint: Function from angle and height of the middle of a cell to the index of its colour.
+        segments: Number of cells around the axis.
+        swell: Function from angle (rad) and height (m) to a factor on the radius, for lobes and spouts.
     """
     section = np.asarray(profile, dtype=np.float64)
     angles = 2.0 * np.pi * np.arange(segments) / segments
@@ -62,7 +62,7 @@ def sleeve(radius: float, levels: ArrayLike, colors: Sequence[Color]) -> trimesh
     """The wall of a cylinder in bands whose edges may wave.
 
     Args:
-        radius: m.
+        radius: Radius of the cylinder, m.
         levels: (K, segments) heights (m) of the edges of the bands, bottom first, one per angle.
         colors: K - 1 colours.
     """

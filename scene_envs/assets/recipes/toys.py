@@ -97,6 +97,6 @@ def toy_train() -> Model:
 
 
 def _feet(vertices: np.ndarray, z: float) -> np.ndarray:
-    """Corners at height ``z`` under the middle of a lying cylinder, so that it rests on what carries it."""
+    """Corners at height ``z`` under the middle of a lying cylinder, so that it rests on its support."""
     ends = vertices[:, 0].min(), vertices[:, 0].max()
     return np.array([[x, y, z] for x in ends for y in (-0.006, 0.006)])

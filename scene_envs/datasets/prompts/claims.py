@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from scene_envs.datasets.prompts.facts import SceneFacts
 
 Side = Literal["left", "right", "front", "back", "next"]
-"""Relations between two things that share a table, a tier or the floor."""
+"""Relations between two objects that share a table, a tier or the floor."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """One thing: "the teapot", "the second cup from the left", "the lamp on the top shelf".
+    """One object: "the teapot", "the second cup from the left", "the lamp on the top shelf".
 
     Attributes:
-        name: display name.
-        ordinal: which one, counted from ``edge``; 0 when it is the only one.
-        edge: left, right, front or back; empty without an ordinal.
-        place: where it is counted; None for the whole scene.
+        name: Display name.
+        ordinal: Rank counted from ``edge``; 0 when there is only one such object.
+        edge: Side from which objects are counted: left, right, front or back; empty without an ordinal.
+        place: Place in which objects are counted; None for the whole scene.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Reference:
     place: Place | None = None
 
     def resolve(self, scene: SceneFacts) -> int:
-        """Index of the thing; -1 when there is none, or when there are several and the reference has no ordinal."""
+        """Index of the object; -1 when there is none, or when there are several and the reference has no ordinal."""
         members = scene.named(self.name)
         if self.place is not None:
             members = members[self.place.holds(scene)[members]]
@@ -52,8 +52,8 @@ class Place:
     """A table, a shelf, or one tier of it: "the second table from the left", "the top shelf".
 
     Attributes:
-        unit: the piece of furniture.
-        tier: 0, 1, … counted from the top, or -1, -2, … counted from the bottom; None for the whole piece.
+        unit: Piece of furniture.
+        tier: Tier 0, 1, … counted from the top, or -1, -2, … counted from the bottom; None for the whole piece.
     """
 
     unit: Reference
@@ -74,12 +74,12 @@ class ClaimCheck:
     """Check of one claim in one scene.
 
     Attributes:
-        claim: what was claimed.
-        expected: the number that the claim gives; 1 for a relation between two things.
-        found: the number in the scene; for a relation 1 when it holds, else 0.
+        claim: Claim that was checked.
+        expected: Number that the claim gives; 1 for a relation between two objects.
+        found: Number in the scene; for a relation 1 when it holds, else 0.
         score: 1 when the claim holds. A number that does not hold scores the smaller number over the larger. A relation
-            that does not hold scores a quarter for each of its two things that is in the scene.
-        slots: slots of the objects that the claim is about, as far as they are in the scene.
+            that does not hold scores a quarter for each of its two objects that is in the scene.
+        slots: Slots of the objects of the claim that are in the scene.
     """
 
     claim: Claim
@@ -124,7 +124,7 @@ class NameCount:
 
 @dataclass(frozen=True)
 class PlaceCount:
-    """ "three cups are on the second table from the left": also those on or in other things there."""
+    """ "three cups are on the second table from the left": objects on or in other objects there are included."""
 
     name: str
     number: int
@@ -138,9 +138,9 @@ class PlaceCount:
 
 @dataclass(frozen=True)
 class SupportCount:
-    """ "two apples are in the bowl", "a mug is on top of the second plate from the left": held by one thing.
+    """ "two apples are in the bowl", "a mug is on top of the second plate from the left": held by one object.
 
-    "On top of" means directly on the thing. "In" means in the thing, directly or on top of something in it.
+    "On top of" means directly on the object. "In" means in the object, directly or on top of another object in it.
     """
 
     name: str
@@ -157,7 +157,7 @@ class SupportCount:
 
 @dataclass(frozen=True)
 class PairCount:
-    """ "two steamer lids are each on top of a steamer bottom": things of one kind held by things of another."""
+    """ "two steamer lids are each on top of a steamer bottom": objects of one name held by objects of another."""
 
     name: str
     number: int
@@ -173,7 +173,7 @@ class PairCount:
 
 @dataclass(frozen=True)
 class SideClaim:
-    """ "the lamp is to the left of the bowl": both things share a table, a tier or the floor."""
+    """ "the lamp is to the left of the bowl": both objects share a table, a tier or the floor."""
 
     subject: Reference
     side: Side
@@ -198,7 +198,7 @@ class PromptFacts:
     """Claims of one prompt.
 
     Attributes:
-        claims: the claims, in the order of the text.
+        claims: Claims in the order of the text.
 
     >>> from scene_envs.datasets import parse_prompt, scene_facts
     >>> from scene_envs.scene import SceneBatch
@@ -241,7 +241,7 @@ def _count(claim: Claim, number: int, scene: SceneFacts, members: NDArray[np.int
 
 
 def holders(scene: SceneFacts, inside: bool) -> NDArray[np.int64]:
-    """(n,) index of the container that each thing lies in if ``inside``, else of the thing it stands on; -1 for none.
+    """(n,) index of the container that each object lies in if ``inside``, else of its support; -1 for none.
 
     An object in a container stands on nothing.
     """

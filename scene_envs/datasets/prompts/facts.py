@@ -19,9 +19,9 @@ SIDES = ("left", "right", "front", "back")
 """Directions of the viewer. Front is toward the viewer, or toward the lower edge of a view from above."""
 
 _CHUNK = 32
-"""Scenes that are worked on together."""
+"""Number of scenes computed together."""
 _FURNITURE = 0.5
-"""Things at least this high (m) are furniture."""
+"""Objects at least this high (m) are furniture."""
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ class Tolerances:
     """Limits within which a relation holds.
 
     Attributes:
-        contact: surfaces this far (m) apart, or into each other, touch; an object that touches nothing is on the table
-            or tier within three times this distance.
-        aside: least offset (m) of two centres to the left, right, front or back.
-        cone: that offset is at least this many times the offset across.
-        beside: largest horizontal distance (m) of two bounding boxes that are next to each other.
-        beside_furniture: the same between pieces of furniture (0.5 m high or more).
-        order: least difference (m) between neighbours in an order such as "the second cup from the left".
+        contact: Largest gap or overlap (m) of surfaces that touch; an object that touches nothing is on the table or
+            tier within three times this distance.
+        aside: Smallest offset (m) of two centres to the left, right, front or back.
+        cone: Smallest ratio of that offset to the offset across.
+        beside: Largest horizontal distance (m) of two bounding boxes that are next to each other.
+        beside_furniture: Largest such distance (m) between pieces of furniture (0.5 m high or more).
+        order: Smallest difference (m) between neighbours in an order such as "the second cup from the left".
 
     Raises:
         InvalidInputError: contact is not in (0, 0.03] m.
@@ -57,7 +57,7 @@ NOMINAL = Tolerances()
 """Tolerances of checks."""
 STRICT = Tolerances(contact=0.005, aside=0.03, cone=1.25, beside=0.04, beside_furniture=0.4, order=0.02)
 LOOSE = Tolerances(contact=0.015, beside=0.06, beside_furniture=0.6)
-"""Prompts are written only when they hold under all three tolerances, so that no prompt depends on a millimetre."""
+"""Prompts are written only when they hold under all three tolerances, so that none depends on small offsets."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +69,10 @@ class SceneFacts:
         slots: (n,) slots of the scene.
         positions: (n, 3) centres of mass in m: to the viewer's right, to the front, up.
         boxes: (n, 2, 3) lowest and highest corner along the same axes.
-        fixed: (n,) bool, welded things such as tables, shelves and floors.
-        tiers: (n,) tiers of each thing, 0 for what has none.
-        held: what holds each object.
-        tolerances: limits within which a relation holds.
+        fixed: (n,) bool, welded objects such as tables, shelves and floors.
+        tiers: (n,) number of tiers of each object.
+        held: Supports of the objects.
+        tolerances: Limits within which a relation holds.
 
     >>> (facts,) = scene_facts(SceneBatch.empty("dimsum_table", 1))
     >>> facts.count, facts.objects

@@ -50,7 +50,7 @@ class Nouns:
         self.article = {name: indefinite_article(name) for name in self.plural}
 
     def counted(self, number: int, name: str) -> str:
-        """A number of things: "a cup", "two cups"."""
+        """A number of objects: "a cup", "two cups"."""
         if number == 1:
             return f"{self.article[name]} {name}"
         return f"{NUMBERS[number] if number < len(NUMBERS) else number} {self.plural[name]}"
@@ -70,8 +70,8 @@ class Nouns:
                 each = "" if number == 1 else " each"
                 return f"{self._are(number, name)}{each} {_held(inside)} {self.counted(1, under)}"
             case SideClaim(subject, side, landmark):
-                beside = say_reference(landmark, near=subject.place)
-                return f"{say_reference(subject)} is {SIDE_PHRASES[side]} {beside}"
+                other = say_reference(landmark, near=subject.place)
+                return f"{say_reference(subject)} is {SIDE_PHRASES[side]} {other}"
         raise AssertionError(claim)
 
     def sentence(self, claims: Sequence[Claim]) -> str:
@@ -84,7 +84,7 @@ class Nouns:
 
 
 def say_reference(reference: Reference, *, near: Place | None = None) -> str:
-    """One thing: "the second cup from the left on the top shelf", or "… on the same shelf" if its place is ``near``."""
+    """One object: "the second cup from the left on the top shelf", or "… on the same shelf" if it is ``near``."""
     first = f"{ORDINALS[reference.ordinal - 1]} " if reference.ordinal else ""
     last = f" from the {reference.edge}" if reference.ordinal else ""
     place = reference.place
@@ -93,7 +93,7 @@ def say_reference(reference: Reference, *, near: Place | None = None) -> str:
 
 
 def place_word(place: Place) -> str:
-    """Noun of a place; tiers are called shelves where they belong to the one thing called a shelf."""
+    """Noun of a place; tiers of the only shelf in a scene are called shelves."""
     if place.tier is None:
         return place.unit.name
     return "shelf" if place.unit == Reference("shelf") else "tier"

@@ -74,7 +74,7 @@ class _Reader:
             self.need([", and", ",", "and"], "a comma, 'and' or the end")
             claims.append(read())
         if len(claims) > 1 and any(isinstance(claim, ObjectCount) for claim in claims):
-            raise self.error("only one number of objects, with nothing beside it")
+            raise self.error("only one number of objects and no other claims")
         return PromptFacts(tuple(claims))
 
     def amount(self) -> Claim:
@@ -91,18 +91,18 @@ class _Reader:
             return SideClaim(subject, side, self.reference(near=subject.place))
         number = self.number()
         name = self.noun(plural=number != 1)
-        self.need(["is" if number == 1 else "are"], "'is' for one thing and 'are' for several")
+        self.need(["is" if number == 1 else "are"], "'is' for one object and 'are' for several")
         each = self.take(["each"])
         how = self.need(_INSIDE if each else [*_INSIDE, "on"], "'on', 'on top of' or 'in'")
         if how == "on":
             return PlaceCount(name, number, self.place())
         if not each and self.rest.startswith("the "):
             return SupportCount(name, number, _INSIDE[how], self.reference())
-        self.need(["a", "an"], "a thing with 'a' or 'an'")
+        self.need(["a", "an"], "an object with 'a' or 'an'")
         return PairCount(name, number, _INSIDE[how], self.noun(plural=False))
 
     def reference(self, *, near: Place | None = None, placed: bool = True) -> Reference:
-        self.need(["the"], "'the' and a thing")
+        self.need(["the"], "'the' and an object")
         ordinal = _ORDINALS.get(self.take(_ORDINALS), 0)
         name = self.noun(plural=False)
         edge = self.edge() if ordinal else ""
@@ -127,7 +127,7 @@ class _Reader:
         tier = ordinal - 1 if end == "top" else -ordinal
         if word == "shelf":
             return Place(Reference("shelf"), tier)
-        self.need(["of"], "'of' and the thing the tier belongs to")
+        self.need(["of"], "'of' and the object to which the tier belongs")
         return Place(self.reference(placed=False), tier)
 
     def number(self) -> int:

@@ -14,13 +14,9 @@ _LAST_ORDINAL = 5
 
 @dataclass(frozen=True, eq=False)
 class ReferringExpressions:
-    """Expressions that single out the same object in every one of several views of a scene.
+    """Expressions that single out the same object in every one of several views of a scene."""
 
-    Attributes:
-        views: the facts of one scene under several tolerances.
-    """
-
-    views: Sequence[SceneFacts]
+    views: Sequence[SceneFacts]  # facts of one scene under several tolerances
     _known: dict[int, list[Reference]] = field(default_factory=dict, repr=False)
 
     @property
@@ -51,7 +47,7 @@ class ReferringExpressions:
         if scene.objects[name] == 1:
             return [Reference(name)]
         places: list[Place | None] = [None]
-        if not scene.fixed[index] and not self._live_together(name):
+        if not scene.fixed[index] and not self._share_place(name):
             unit, tier = int(scene.held.place[index]), int(scene.held.tier[index])
             places = [*self.places(unit, tier)] if unit >= 0 else []
         found = [Reference(name, place=place) for place in places if place is not None]
@@ -61,8 +57,8 @@ class ReferringExpressions:
         ranked = [reference for place in places for reference in self._ranked(index, name, place)]
         return [reference for reference in ranked if self._is_clear(reference, index)]
 
-    def _live_together(self, name: str) -> bool:
-        """Whether all things of that name are on one table, tier or floor."""
+    def _share_place(self, name: str) -> bool:
+        """Whether all objects of that name are on one table, tier or floor."""
         members, held = self.scene.named(name), self.scene.held
         return len(set(zip(held.place[members].tolist(), held.tier[members].tolist(), strict=True))) == 1
 

@@ -33,16 +33,16 @@ _T = TypeVar("_T")
 KINDS = ("count", "names", "relations")
 """The kinds of prompts."""
 
-_MOST_NAMES = 10
-"""Names in one prompt at most."""
-_MOST_RELATIONS = 3
-"""Relations in one prompt at most."""
+_MAX_NAMES = 10
+"""Largest number of names in one prompt."""
+_MAX_RELATIONS = 3
+"""Largest number of relations in one prompt."""
 _TRIES = 8
 """Draws for each relation, and for a prompt that differs from the others of its scene."""
 
 
 def describe(batch: SceneBatch, rng: np.random.Generator, *, kinds: Sequence[str] = KINDS) -> list[str]:
-    """One prompt per scene, of a random kind; a count where that kind has nothing to say.
+    """One prompt per scene, of a random kind; a count where the scene has no claims of that kind.
 
     Raises:
         InvalidInputError: an unknown kind.
@@ -54,7 +54,7 @@ def describe(batch: SceneBatch, rng: np.random.Generator, *, kinds: Sequence[str
 
 
 def describe_all(batch: SceneBatch, rng: np.random.Generator, *, count: int = 3) -> list[tuple[str, ...]]:
-    """``count`` prompts per scene, of different kinds and without duplicates where the scene has that much to say.
+    """``count`` prompts per scene, of different kinds and without duplicates where the scene has enough claims.
 
     Raises:
         InvalidInputError: ``count`` is not positive.
@@ -72,7 +72,7 @@ def _writers(batch: SceneBatch, rng: np.random.Generator) -> list[_Writer]:
 
 @dataclass(frozen=True, eq=False)
 class _Writer:
-    """Writes about one scene, seen under strict, nominal and loose tolerances."""
+    """Writer of prompts about one scene, with its facts under strict, nominal and loose tolerances."""
 
     views: tuple[SceneFacts, ...]
     referring: ReferringExpressions
@@ -85,7 +85,7 @@ class _Writer:
         return self.views[1]
 
     def write(self, kind: str) -> str:
-        """A prompt of ``kind``, or a count when there is nothing else to say."""
+        """A prompt of ``kind``, or a count when the scene has no claims of that kind."""
         claims: list[Claim] = []
         if kind == "names":
             claims = [NameCount(name, self.scene.objects[name]) for name in self._names()]
@@ -110,7 +110,7 @@ class _Writer:
         names = sorted(self.scene.objects)
         whole = self.rng.random() < 0.5
         size = len(names) if whole or len(names) < 2 else int(self.rng.integers(1, len(names) + 1))
-        chosen = [names[i] for i in self.rng.permutation(len(names))[: min(size, _MOST_NAMES)]]
+        chosen = [names[i] for i in self.rng.permutation(len(names))[: min(size, _MAX_NAMES)]]
         free = sorted({self.scene.names[i] for i in np.flatnonzero(~self.scene.fixed)})
         return chosen if set(free) & set(chosen) or not free else [*chosen[1:], self._pick(free)]
 
@@ -122,7 +122,7 @@ class _Writer:
         families += [self._stay] if self._stays else []
         families += [self._aside] if len(self._neighbors) else []
         claims: dict[Hashable, Claim] = {}
-        wanted = int(self.rng.integers(1, _MOST_RELATIONS + 1)) if families else 0
+        wanted = int(self.rng.integers(1, _MAX_RELATIONS + 1)) if families else 0
         for _ in range(_TRIES * (wanted + 2)):
             if len(claims) == wanted:
                 break
@@ -132,7 +132,7 @@ class _Writer:
         return list(claims.values())
 
     def _topic(self, claim: Claim) -> Hashable:
-        """The things that a relation is about; a prompt has at most one relation about the same things."""
+        """The objects of a relation; a prompt has at most one relation about the same objects."""
         match claim:
             case PairCount(name, _, _, under):
                 return name, under
@@ -145,11 +145,9 @@ class _Writer:
     def _is_clear(self, claim: Claim) -> bool:
         return all(claim.check(view).holds for view in self.views)
 
-    # -- what is held ---------------------------------------------------------------------------------
-
     @cached_property
     def _holds(self) -> Counter[tuple[str, bool, int]]:
-        """(upper name, inside, index of a free lower thing) to the number of such pairs."""
+        """Number of pairs by (upper name, inside, index of a free lower object)."""
         scene, holds = self.scene, Counter[tuple[str, bool, int]]()
         for upper, lower in enumerate(scene.held.support):
             if lower >= 0 and not scene.fixed[lower] and not scene.held.contained[upper]:
@@ -160,7 +158,7 @@ class _Writer:
 
     @cached_property
     def _pairs(self) -> Counter[tuple[str, bool, str]]:
-        """(upper name, inside, lower name) to the number of such pairs."""
+        """Number of pairs by (upper name, inside, lower name)."""
         pairs = Counter[tuple[str, bool, str]]()
         for (name, inside, lower), number in self._holds.items():
             pairs[name, inside, self.scene.names[lower]] += number
@@ -177,11 +175,9 @@ class _Writer:
         landmark = self._refer(lower)
         return None if landmark is None else SupportCount(name, self._holds[name, inside, lower], inside, landmark)
 
-    # -- where things are -----------------------------------------------------------------------------
-
     @cached_property
     def _stays(self) -> Counter[tuple[str, int, int]]:
-        """(name, place, tier) to the number of such objects.
+        """Number of objects by (name, place, tier).
 
         Only places that have tiers or stand on another place count; the floor is no place.
         """
@@ -196,11 +192,9 @@ class _Writer:
         place = self._pick(places) if places else None
         return None if place is None else PlaceCount(name, self._stays[name, unit, tier], place)
 
-    # -- sides ----------------------------------------------------------------------------------------
-
     @cached_property
     def _neighbors(self) -> NDArray[np.int64]:
-        """(P, 2) things that share a place."""
+        """(P, 2) pairs of objects that share a place."""
         held = self.scene.held
         place, tier = held.place, held.tier
         same = (place[:, None] == place) & (tier[:, None] == tier) & (place >= 0)
@@ -215,7 +209,7 @@ class _Writer:
         if subject is None or landmark is None:
             return None
         claim = SideClaim(subject, self._pick(sides), landmark)
-        return None if _goes_without_saying(claim) else claim
+        return None if _repeats_order(claim) else claim
 
     def _is_side(self, side: Side, first: int, second: int) -> bool:
         if side == "next":
@@ -230,7 +224,7 @@ class _Writer:
         return items[int(self.rng.integers(len(items)))]
 
 
-def _goes_without_saying(claim: SideClaim) -> bool:
+def _repeats_order(claim: SideClaim) -> bool:
     """Whether the claim repeats an order: "the first cup from the left is to the left of the second from the left"."""
     words = {claim.subject.edge, claim.side, claim.landmark.edge}
     return claim.subject.name == claim.landmark.name and (words <= {"left", "right"} or words <= {"front", "back"})

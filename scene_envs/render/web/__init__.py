@@ -1,1 +1,1 @@
-"""The page of the viewer: HTML, style and scripts, joined into one file by :mod:`scene_envs.render.viewer`."""
+"""Page of the viewer: HTML, style and scripts, joined into one file by :mod:`scene_envs.render.viewer`."""
