@@ -88,6 +88,8 @@ def test_results_come_in_order_for_any_number_of_workers(workers: int) -> None:
         once = ("key", lambda: ("once", 7))
         assert pool.map(tasks("sent", *range(6), once=once)) == [7] * 6
         assert pool.map([]) == []
+        processes = pool.process_ids
+    assert not any(is_running(process) for process in processes)
 
 
 def test_a_task_that_fails_is_split_and_a_part_that_fails_again_has_a_reason(pool: WorkerPool) -> None:

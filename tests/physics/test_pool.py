@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import threading
-import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -149,20 +148,3 @@ def test_wrong_arguments_and_a_closed_pool_are_refused(batch: SceneBatch) -> Non
     pool.close()
     with pytest.raises(PhysicsError, match="closed"):
         feasibility(batch[:1], pool=pool)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
-def test_closing_ends_the_processes() -> None:
-    pool = PhysicsPool(workers=1)
-    feasibility(scene(("cube", 0.0, 0.0, 0.0)), pool=pool)
-    (process,) = pool.process_ids
-    pool.close()
-    deadline = time.monotonic() + 10.0
-    while time.monotonic() < deadline:
-        try:
-            os.kill(process, 0)
-        except ProcessLookupError:
-            return
-        time.sleep(0.01)
-    pytest.fail("the worker is still running")
