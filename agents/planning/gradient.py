@@ -88,10 +88,10 @@ class GradientPlanner(PlannerSettings):
         return build(settings, keys, "planner.planner.")
 
     def _guide(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Guidance:
-        from agents.planning import guidance
+        from agents.planning.guidance import Guidance
 
         weight = self.weight if callable(self.weight) else getattr(guidance, self.weight)
-        return guidance.Guidance(weight, self.strength, self.begin)
+        return Guidance(weight, self.strength, self.begin)
 
 
 def _is_guidable(settings: type[PlannerSettings]) -> bool:

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scene_envs.datasets import store
+from scene_envs.datasets.store import METADATA, make_metadata, shard_name, write_shard
 from scene_envs.datasets.files import Rows, find_files, find_metadata, list_blocks, read_block, to_rows
 from scene_envs.datasets.info import DatasetInfo, read_metadata
 from scene_envs.datasets.layout import FIXED_TOLERANCE, Layout, scene_keys
@@ -103,7 +103,7 @@ class SceneDataset:
         layout = make_layout(metadata or find_metadata(path), scene_type, aliases, fixed_tolerance, slots)
         blocks = (block for file in files for block in list_blocks(file))
         dataset = cls._collect((read_block(block, layout.info.features) for block in blocks), layout, limit)
-        own = metadata is None and (Path(path) / store.METADATA).is_file()
+        own = metadata is None and (Path(path) / METADATA).is_file()
         if own and not dataset.complete and (limit is None or len(dataset) < limit):
             logger.warning(
                 "%r holds %d of the %d requested scenes: shards are missing, or are still being generated; "
@@ -225,13 +225,13 @@ class SceneDataset:
         if any(folder.glob("*.parquet")):
             raise InvalidInputError(f"{str(folder)!r} already holds parquet files; choose an empty folder")
         folder.mkdir(parents=True, exist_ok=True)
-        metadata = store.make_metadata(self.scene_type, self.normalizer, count=len(self))
+        metadata = make_metadata(self.scene_type, self.normalizer, count=len(self))
         metadata["max_num_objects_per_scene"] = self.tensor.shape[1]
-        write_json(folder / store.METADATA, with_digest(metadata), indent=2)
+        write_json(folder / METADATA, with_digest(metadata), indent=2)
         for index, start in enumerate(range(0, len(self), shard_size)):
             chunk = slice(start, start + shard_size)
             scenes = self.normalizer.normalize(self.tensor[chunk]).numpy()
-            store.write_shard(folder / store.shard_name(index), scenes, self.prompt_sets[chunk], {})
+            write_shard(folder / shard_name(index), scenes, self.prompt_sets[chunk], {})
         return folder
 
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from scene_envs.datasets import store
+from scene_envs.datasets.store import METADATA, PROMPTS, PROMPT_SETS, SCENES, open_parquet
 from scene_envs.errors import CorruptFileError, InvalidInputError
 
 _STATE, _SPLITS = "state.json", "dataset_dict.json"
@@ -78,15 +78,15 @@ def find_metadata(path: str | os.PathLike[str]) -> Path:
     """
     path = Path(path)
     folder = path if path.is_dir() else path.parent
-    above = folder.parent / store.METADATA
-    return above if above.is_file() and not (folder / store.METADATA).is_file() else folder / store.METADATA
+    above = folder.parent / METADATA
+    return above if above.is_file() and not (folder / METADATA).is_file() else folder / METADATA
 
 
 def list_blocks(file: Path) -> list[Block]:
     """The blocks of one file, found without reading its scenes; raises CorruptFileError."""
     if file.suffix == ".arrow":
         return _cut(file, _arrow_table(file).num_rows)
-    metadata = store.open_parquet(file).metadata
+    metadata = open_parquet(file).metadata
     blocks: list[Block] = []
     start = 0
     for group in range(metadata.num_row_groups):
@@ -107,7 +107,7 @@ def read_block(block: Block, features: int) -> Rows:
             table = _arrow_table(block.file)
             present = _columns(table.column_names, str(block.file))
             return to_rows(table.slice(block.start, block.rows).select(present), features, str(block.file), block.start)
-        parquet = store.open_parquet(block.file)
+        parquet = open_parquet(block.file)
         present = _columns(parquet.schema_arrow.names, str(block.file))
         table = _within_group(parquet.iter_batches(BLOCK, row_groups=[block.group], columns=present), block)
     except (pa.ArrowException, OSError, ValueError) as error:
@@ -129,7 +129,7 @@ def to_rows(table: pa.Table, features: int, place: str, start: int = 0) -> Rows:
     """
     _columns(table.column_names, place)
     try:
-        scenes = _to_array(_one_array(table[store.SCENES]), features, start)
+        scenes = _to_array(_one_array(table[SCENES]), features, start)
         prompt_sets = _prompt_sets(table)
     except (pa.ArrowException, ValueError) as error:
         raise CorruptFileError(
@@ -188,15 +188,15 @@ def _within_group(batches: Iterator[pa.RecordBatch], block: Block) -> pa.Table:
 
 def _columns(names: Sequence[str], place: str) -> list[str]:
     """Names of the columns that are read from a file with the columns ``names``."""
-    missing = [name for name in (store.SCENES, store.PROMPTS) if name not in names]
+    missing = [name for name in (SCENES, PROMPTS) if name not in names]
     if missing:
         raise CorruptFileError(f"{place!r} lacks the column(s) {missing}; it has {list(names)}")
-    return [name for name in (store.SCENES, store.PROMPTS, store.PROMPT_SETS) if name in names]
+    return [name for name in (SCENES, PROMPTS, PROMPT_SETS) if name in names]
 
 
 def _prompt_sets(table: pa.Table) -> list[tuple[str, ...]]:
-    column = store.PROMPT_SETS if store.PROMPT_SETS in table.column_names else store.PROMPTS
-    first = table[store.PROMPTS].to_pylist()
+    column = PROMPT_SETS if PROMPT_SETS in table.column_names else PROMPTS
+    first = table[PROMPTS].to_pylist()
     sets = []
     for one, texts in zip(first, table[column].to_pylist(), strict=True):
         listed = texts if isinstance(texts, list) else [texts]
@@ -246,7 +246,7 @@ def _check_complete(lists: pa.Array, start: int, what: str, per_row: int = 1) ->
     if not (
         pa.types.is_list(lists.type) or pa.types.is_large_list(lists.type) or pa.types.is_fixed_size_list(lists.type)
     ):
-        raise ValueError(f"column {store.SCENES!r} holds {lists.type}, expected lists of floats")
+        raise ValueError(f"column {SCENES!r} holds {lists.type}, expected lists of floats")
     if lists.null_count:
         row = start + int(np.flatnonzero(np.asarray(lists.is_null()))[0]) // per_row
         raise ValueError(f"row {row} has a missing {what}")

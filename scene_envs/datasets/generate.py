@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from scene_envs.datasets import store
+from scene_envs.datasets.store import METADATA, make_metadata, read_notes, remove_partial, shard_name, verify, write_bytes
 from scene_envs.datasets.info import read_metadata
 from scene_envs.datasets.progress import Report, generation_progress
 from scene_envs.datasets.ranges import fixed_normalizer
@@ -104,7 +104,7 @@ def generate(
     settings = {"grammar": scene_type, "seed": seed, "count": count, "shard_size": shard_size, "verified": verify}
     normalizer = _prepare(folder, grammar, settings)
     sizes = [min(shard_size, count - first) for first in range(0, count, shard_size)]
-    jobs = [Job(index, size, seed, verify, str(folder / store.shard_name(index))) for index, size in enumerate(sizes)]
+    jobs = [Job(index, size, seed, verify, str(folder / shard_name(index))) for index, size in enumerate(sizes)]
     left = [job for job in jobs if not _is_made(job)]
     with generation_progress(
         f"Generating {scene_type}", count - sum(job.size for job in left), count, progress
@@ -143,7 +143,7 @@ def _make(
                 "fewer workers"
             ) from shard
         if shard is not None:
-            store.write_bytes(Path(task.body.path), shard)
+            write_bytes(Path(task.body.path), shard)
 
     with WorkerPool(
         f"{__name__}:ShardMaker",
@@ -204,9 +204,9 @@ class ShardMaker:
 def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normalizer:
     """Make the folder and its metadata, or check that they fit ``settings``; returns the normalizer."""
     scene_type: SceneType = get_scene_type(grammar.scene_type)
-    path = folder / store.METADATA
+    path = folder / METADATA
     try:
-        store.remove_partial(folder)
+        remove_partial(folder)
         if path.exists():
             info = read_metadata(path)
             differing = [key for key in _SETTINGS if info.metadata.get(key) != settings[key]]
@@ -220,7 +220,7 @@ def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normal
             return info.normalizer
         if folder.is_dir() and any(folder.glob("*.parquet")):
             raise InvalidInputError(
-                f"{str(folder)!r} holds parquet files but no {store.METADATA}; choose an empty folder"
+                f"{str(folder)!r} holds parquet files but no {METADATA}; choose an empty folder"
             )
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
@@ -228,7 +228,7 @@ def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normal
     except OSError as error:
         raise storage_error(folder, error) from error
     normalizer = fixed_normalizer(grammar)
-    write_json(path, with_digest(store.make_metadata(scene_type, normalizer, **settings)), indent=2)
+    write_json(path, with_digest(make_metadata(scene_type, normalizer, **settings)), indent=2)
     return normalizer
 
 
@@ -237,10 +237,10 @@ def _is_made(job: Job) -> bool:
     path = Path(job.path)
     if not path.is_file():
         return False
-    rows = store.read_notes(path)["rows"]
+    rows = read_notes(path)["rows"]
     if rows != job.size:
         raise CorruptFileError(f"{job.path!r} holds {rows} scenes, expected {job.size}; delete it and run again")
-    store.verify(path)
+    verify(path)
     return True
 
 
@@ -249,7 +249,7 @@ def _report(folder: Path, jobs: list[Job], count: int, seconds: float) -> Genera
     tried = 0
     for job in jobs:
         shard_journal(job).remove()
-        notes = store.read_notes(Path(job.path))
+        notes = read_notes(Path(job.path))
         reasons.update(notes["reasons"])
         tried += notes["tried"]
     return GenerationReport(folder, count, tried, dict(reasons.most_common()), seconds)

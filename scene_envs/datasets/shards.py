@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.datasets import store
+from scene_envs.datasets.store import encode_shard, write_bytes
 from scene_envs.datasets.journal import Journal
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.datasets.verification import KEPT, judge_scenes
@@ -106,7 +106,7 @@ def make_shard(
     batch = SceneBatch(torch.stack(kept), grammar.scene_type)
     prompt_sets = describe_all(batch, np.random.default_rng([job.seed, job.index, 1]))
     notes = {"tried": tried, "reasons": dict(sorted((+reasons).items()))}
-    return store.encode_shard(normalizer.normalize(batch.tensor).numpy(), prompt_sets, notes)
+    return encode_shard(normalizer.normalize(batch.tensor).numpy(), prompt_sets, notes)
 
 
 def _draw(grammar: Grammar, job: Job, first: int, count: int) -> tuple[Tensor, list[Counter[str]]]:
@@ -131,7 +131,7 @@ def _judge(scenes: Tensor, grammar: Grammar, normalizer: Normalizer, verify: boo
 def write_shard(job: Job, grammar: Grammar, normalizer: Normalizer) -> Generator[tuple[int, int, dict[str, int]]]:
     """Make one shard with a journal, and write it; yields as :func:`make_shard`, raises StorageError."""
     journal = shard_journal(job)
-    store.write_bytes(Path(job.path), (yield from make_shard(job, grammar, normalizer, journal)))
+    write_bytes(Path(job.path), (yield from make_shard(job, grammar, normalizer, journal)))
     journal.remove()
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.envs import mask_generators as shipped
+from scene_envs.envs.mask_generators import BalancedMask, CulpritsMask, EmptyMask, ExplicitMask, LowestScoringMask, OffPromptMask, RegionMask, blamed_or_empty_mask, infeasible_mask, infeasible_or_empty_mask, penetrating_mask, random_mask, unstable_mask
 from scene_envs.envs.scoring import Score
 from scene_envs.errors import InvalidInputError, SceneEnvsError, unknown_name
 from scene_envs.plugins import load_plugin
@@ -32,19 +32,19 @@ ENTRY_POINT_GROUP = "scene_envs.masks"
 Generator = TypeVar("Generator", bound=MaskGenerator)
 
 _SHIPPED: dict[str, MaskGenerator] = {
-    "balanced": shipped.BalancedMask(),
-    "blamed_or_empty": shipped.blamed_or_empty_mask,
-    "culprits": shipped.CulpritsMask(),
-    "empty": shipped.EmptyMask(),
-    "explicit": shipped.ExplicitMask(),
-    "infeasible": shipped.infeasible_mask,
-    "infeasible_or_empty": shipped.infeasible_or_empty_mask,
-    "lowest_scoring": shipped.LowestScoringMask(),
-    "off_prompt": shipped.OffPromptMask(),
-    "penetrating": shipped.penetrating_mask,
-    "random": shipped.random_mask,
-    "region": shipped.RegionMask(),
-    "unstable": shipped.unstable_mask,
+    "balanced": BalancedMask(),
+    "blamed_or_empty": blamed_or_empty_mask,
+    "culprits": CulpritsMask(),
+    "empty": EmptyMask(),
+    "explicit": ExplicitMask(),
+    "infeasible": infeasible_mask,
+    "infeasible_or_empty": infeasible_or_empty_mask,
+    "lowest_scoring": LowestScoringMask(),
+    "off_prompt": OffPromptMask(),
+    "penetrating": penetrating_mask,
+    "random": random_mask,
+    "region": RegionMask(),
+    "unstable": unstable_mask,
 }
 _MASKS: Registry[MaskGenerator] = Registry(
     "mask generator", ENTRY_POINT_GROUP, _SHIPPED, read=lambda point: _checked(point.name, load_plugin(point))

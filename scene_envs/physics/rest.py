@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics import rigid
+from scene_envs.physics.rigid import apply
 from scene_envs.physics.collision import NEAR, scene_pairs
 from scene_envs.physics.constants import GRAVITY
 from scene_envs.physics.geometry import AssetGeometry, LibraryGeometry
@@ -148,7 +148,7 @@ class Statics:
         """(n, 2) centre of mass of each object together with everything on it, world frame."""
         mass = self._mass[objects.category].copy()
         local = self._library.center_of_mass[objects.category]
-        moment = mass[:, None] * (objects.translation + rigid.apply(objects.rotation, local))[:, :2]
+        moment = mass[:, None] * (objects.translation + apply(objects.rotation, local))[:, :2]
         for level in range(int(height.max(initial=0)), 0, -1):
             rows = np.flatnonzero((height == level) & (support >= 0))
             np.add.at(mass, support[rows], mass[rows])

@@ -8,7 +8,7 @@ import numpy as np
 
 from scene_envs.arrays import Array
 from scene_envs.physics.budget import Budget
-from scene_envs.physics.collision import ObjectPairs
+from scene_envs.physics.pairs import ObjectPairs
 from scene_envs.physics.motion import Physics, advance
 from scene_envs.physics.placement import Objects
 from scene_envs.physics.rest import Rest

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics import rigid
+from scene_envs.physics.rigid import angle_between, apply, matrices, quaternions, times
 from scene_envs.physics.bodies import SCALE, BodyKey, BodyPool
 from scene_envs.physics.budget import Budget
 from scene_envs.physics.constants import GRAVITY
@@ -81,8 +81,8 @@ class World:
         category, fixed, count = objects.category, objects.fixed, len(objects)
         axes = np.array([self._pool.principal(c)[1] for c in category.tolist()])
         center = self._library.center_of_mass[category]
-        start_quaternion = rigid.quaternions(rigid.times(objects.rotation, axes))
-        start_position = SCALE * (objects.translation + rigid.apply(objects.rotation, center))
+        start_quaternion = quaternions(times(objects.rotation, axes))
+        start_position = SCALE * (objects.translation + apply(objects.rotation, center))
 
         bodies, order = self._bodies(objects, fine)
         damping = settings.linear_damping, settings.angular_damping
@@ -120,10 +120,10 @@ class World:
             left |= leaving
         self._leave(bodies, category, order[~left[order]], end_position, end_quaternion)
 
-        end_rotation = rigid.matrices(end_quaternion)
-        new_rotation = rigid.times(end_rotation, axes.swapaxes(-1, -2))
-        new_translation = end_position / SCALE - rigid.apply(new_rotation, center)
-        angle = rigid.angle_between(start_quaternion, end_quaternion)
+        end_rotation = matrices(end_quaternion)
+        new_rotation = times(end_rotation, axes.swapaxes(-1, -2))
+        new_translation = end_position / SCALE - apply(new_rotation, center)
+        angle = angle_between(start_quaternion, end_quaternion)
         if not (np.isfinite(end_position).all() and np.isfinite(end_quaternion).all()):
             self._pool.clear()
         return new_rotation, new_translation, angle, left
