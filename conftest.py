@@ -25,11 +25,11 @@ gc.disable()  # what collection imports is kept: the search of it for garbage co
 def _registries() -> list[dict[str, Any]]:
     """Every registry that users add to by name, the built-in entries in place."""
     from agents.networks.registry import _ENTRIES
-    from agents.planning.registry import _PLANNERS
-    from agents.post_training.algorithms import _ALGORITHMS
+    from agents.planning.ledger import _PLANNERS
+    from agents.post_training.settings import _ALGORITHMS
     from rewards.registry import _REWARDS
     from scene_envs.envs.masks import _MASKS
-    from scene_envs.export.formats import _FORMATS
+    from scene_envs.export.api import _FORMATS
     from scene_envs.grammars.grammar import GRAMMARS
     from scene_envs.scene_types.registry import _SCENE_TYPES
 
@@ -43,7 +43,7 @@ def _load_shipped() -> None:
 
     Once per process: names of installed packages are read from all their metadata, which takes 0.1 s.
     """
-    from agents.planning.registry import _PLANNERS
+    from agents.planning.ledger import _PLANNERS
     from scene_envs.grammars.grammar import GRAMMARS
 
     for registry in (GRAMMARS, _PLANNERS):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from scene_envs.lazy import lazy_names
+from scene_envs.registry import lazy_names
 
 if TYPE_CHECKING:
     from agents.evaluation import evaluate

@@ -24,7 +24,7 @@ from projection import HEAPS, heap
 from scipy.spatial.transform import Rotation
 
 from rewards import Reward, RewardOutput, evaluate_reward, make_reward
-from rewards.verdicts import forget_verdicts
+from rewards.feasible import forget_verdicts
 from scene_envs.errors import SceneEnvsError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle

@@ -23,9 +23,8 @@ from rich.table import Table
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import FeasibilityResult, feasibility
 from scene_envs.physics.motion import Physics, physics_of
-from scene_envs.physics.pairs import ObjectPairs
-from scene_envs.physics.placement import Objects
-from scene_envs.physics.rest import Rest
+from scene_envs.physics.placement import ObjectPairs, Objects
+from scene_envs.physics.statics import Rest
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import list_scene_types
 

@@ -22,9 +22,9 @@ from rich.table import Table
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from scene_envs.physics.features import PartFeatures
-from scene_envs.physics.narrowphase import PenetrationDepth
-from scene_envs.physics.separation import PlacedParts
+from scene_envs.physics.collision import PenetrationDepth
+from scene_envs.physics.parts import PartFeatures
+from scene_envs.physics.placement import PlacedParts
 from scene_envs.scene_types import get_scene_type, list_scene_types
 
 Array = NDArray[np.float64]

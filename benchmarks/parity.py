@@ -67,7 +67,7 @@ from scene_envs.assets.base import Asset
 from scene_envs.export import PlacedScene, place
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import FeasibilityResult, PhysicsPool, feasibility
-from scene_envs.physics.constants import FRICTION
+from scene_envs.physics.parts import FRICTION
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import list_scene_types
 

@@ -37,10 +37,8 @@ from scene_envs.assets.shapes import convex_hull
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import project
 from scene_envs.physics.motion import Physics, physics_of
-from scene_envs.physics.placement import Level, Objects, flatten, part_pairs, place
-from scene_envs.physics.planes import CLEARANCE
-from scene_envs.physics.projection import TOLERANCE
-from scene_envs.physics.separation import PlacedParts
+from scene_envs.physics.placement import Level, Objects, PlacedParts, flatten, part_pairs, place
+from scene_envs.physics.projection import CLEARANCE, TOLERANCE
 from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import list_scene_types

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rewards import RewardContext, evaluate_reward, learned_parts, list_rewards, resolve_reward
-from rewards.verdicts import forget_verdicts
+from rewards.feasible import forget_verdicts
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.grammars import Grammar, get_grammar
-from scene_envs.grammars.containers import Containers
+from scene_envs.grammars.layout import Containers
 from scene_envs.scene_types import SceneType, get_scene_type, list_scene_types
 
 Counts = NDArray[np.int64]

@@ -46,9 +46,9 @@ from search_costs import CONSOLE, crowding, overhead
 from search_winners import curve, pictures, rest
 
 from agents.planning import Session, list_planners
-from agents.planning.registry import planner_settings
+from agents.planning.ledger import planner_settings
 from scene_envs.envs import SearchEnv
-from scene_envs.envs.resolvers import resolve_prior
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.scene import SceneBatch
 
 

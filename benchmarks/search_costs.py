@@ -14,13 +14,11 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from agents.planning.guidance import Guidance, overlap
-from agents.planning.registry import planner_settings
+from agents.planning.gradient import Guidance, overlap
+from agents.planning.ledger import planner_settings
 from scene_envs.envs import SearchEnv
-from scene_envs.envs.mask_generators import BalancedMask, CulpritsMask
-from scene_envs.envs.masks import resolve_mask
-from scene_envs.envs.resolvers import resolve_prior
-from scene_envs.envs.scoring import RewardScorer
+from scene_envs.envs.masks import BalancedMask, CulpritsMask, resolve_mask
+from scene_envs.envs.scoring import RewardScorer, resolve_prior
 from scene_envs.scene import SceneBatch
 
 CONSOLE = Console(width=120)

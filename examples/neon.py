@@ -39,7 +39,7 @@ from torch.nn.utils import clip_grad_norm_
 from agents import ScenePrior
 from agents.cli import main
 from agents.post_training import Algorithm, AlgorithmSettings, DenoisingPolicy, register_algorithm
-from agents.post_training.gradients import BatchGradient
+from agents.post_training.algorithms.base import BatchGradient
 from agents.post_training.rollouts import finished_scenes, text_of
 
 

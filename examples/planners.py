@@ -22,8 +22,7 @@ from torch import Tensor
 
 from agents.cli import main
 from agents.planning import Ledger, PlannerSettings, PlanResult, Searchable, register_planner
-from agents.planning.ledger import Candidate, Progress, Steered
-from agents.planning.registry import check_at_least
+from agents.planning.ledger import Candidate, Progress, Steered, check_at_least
 from scene_envs import SceneBatch
 from scene_envs.errors import InvalidInputError
 

@@ -4,26 +4,32 @@ A reward is any callable ``(SceneBatch, RewardContext) -> RewardOutput``. The sa
 reinforcement learning, search and evaluation.
 """
 
-from rewards.base import Reward, RewardContext, RewardOutput, averages_objects, counts_objects, depends_on_batch
-from rewards.category_count import CategoryCount
+from rewards.base import (
+    LearnedReward,
+    Reward,
+    RewardContext,
+    RewardOutput,
+    averages_objects,
+    counts_objects,
+    depends_on_batch,
+    learned_parts,
+)
+from rewards.check import check_reward
 from rewards.clutter import Clutter
 from rewards.composite import Clip, Gate, Product, WeightedSum
-from rewards.contract import check_reward
+from rewards.counts import CategoryCount, ObjectCount
 from rewards.coverage import Coverage
 from rewards.diversity import Diversity
 from rewards.evaluation import evaluate_reward
-from rewards.feasible_objects import FeasibleObjects
-from rewards.feasible_share import FeasibleShare
-from rewards.learned import LearnedReward, learned_parts
-from rewards.local_files import allow_local_rewards
-from rewards.object_count import ObjectCount
+from rewards.feasible import FeasibleObjects, FeasibleShare
 from rewards.penetration import Penetration
 from rewards.process import IsolatedReward
-from rewards.prompt_match import PromptMatch
+from rewards.prompt_match import PromptMatch, Relation
 from rewards.reachability import Reachability
 from rewards.realism import Realism
 from rewards.registry import (
     RewardInfo,
+    allow_local_rewards,
     allow_reward_targets,
     list_rewards,
     make_reward,
@@ -33,7 +39,6 @@ from rewards.registry import (
     reward_label,
     reward_name,
 )
-from rewards.relation import Relation
 from rewards.stability import Stability
 
 __all__ = [

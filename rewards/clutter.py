@@ -13,8 +13,7 @@ from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
 from scene_envs.arrays import Array, Index
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import SceneBatch
-from scene_envs.scene_facts import hull_corners
+from scene_envs.scene import SceneBatch, hull_corners
 
 if TYPE_CHECKING:
     from scene_envs.datasets.prompts import SceneFacts

@@ -18,22 +18,25 @@ from rewards.base import (
     counts_objects,
     declared_maximum,
     depends_on_batch,
+    learned_parts,
 )
-from rewards.evaluation import describe_error, evaluate_reward
-from rewards.learned import learned_parts
-from rewards.local_files import allow_local_rewards, allowed_files, is_local, local_files, names_in
+from rewards.evaluation import current_draw, describe_error, evaluate_reward, other_draw, seeded_generators
 from rewards.registry import (
     RewardInfo,
+    allow_local_rewards,
     allow_reward_targets,
+    allowed_files,
     allowed_targets,
+    is_local,
     is_own,
+    local_files,
+    names_in,
     plugin_module,
     registered_module,
     resolve_reward,
     reward_info,
     reward_name,
 )
-from rewards.seeding import current_draw, other_draw, seeded_generators
 from scene_envs.errors import InvalidInputError, RewardError, RewardTimeoutError, SceneEnvsError, UnknownNameError
 from scene_envs.physics import PhysicsPool
 from scene_envs.scene import SceneBatch

@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
-from scene_envs.envs.resolvers import resolve_prior
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.protocols import LikelihoodPriorLike
 from scene_envs.scene import SceneBatch

@@ -2,21 +2,164 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
-from collections.abc import Callable, Mapping
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
-from rewards.base import Reward
-from rewards.function_reward import FunctionReward
-from rewards.local_files import is_local, load_local
+import torch
+from torch import Tensor
+
+from rewards.base import Reward, RewardContext, RewardOutput, averages_objects, counts_objects, depends_on_batch
 from scene_envs.errors import InvalidInputError, RewardError
-from scene_envs.plugins import PluginError, load_plugin
-from scene_envs.registry import Registry
+from scene_envs.registry import PluginError, Registry, load_plugin
+from scene_envs.scene import SceneBatch
+
+
+class FunctionReward:
+    """A bare function as a reward.
+
+    Args:
+        function: function of ``(batch)`` or ``(batch, context)`` and keyword settings, which returns (B,) numbers or a
+            :class:`RewardOutput`.
+        name: name of the reward in logs; the function's own by default.
+        **settings: keyword arguments of every call.
+
+    >>> FunctionReward(lambda batch: batch.counts, name="count")(SceneBatch.empty("dimsum_table", 2), RewardContext())
+    RewardOutput(value=tensor([1., 1.]), per_object=None, terms={}, valid=None, object_flags={}, problem='')
+    """
+
+    def __init__(self, function: Callable[..., Any], name: str | None = None, **settings: Any) -> None:
+        self.function = function
+        self.name = str(name or getattr(function, "__name__", type(function).__name__))
+        self.settings = settings
+        self.maximum = getattr(function, "maximum", None)
+        self.depends_on_batch, self.averages_objects = depends_on_batch(function), averages_objects(function)
+        self.counts_objects = counts_objects(function)
+        self._takes_context = _accepts(function, 2, settings, self.name)
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        arguments = (batch, context) if self._takes_context else (batch,)
+        return as_output(self.function(*arguments, **self.settings))
+
+    def __repr__(self) -> str:
+        return f"FunctionReward({self.name!r})"
+
+
+def as_output(result: Any) -> Any:
+    """A bare tensor as a RewardOutput, whole numbers as floats; anything else as it is."""
+    if not isinstance(result, Tensor):
+        return result
+    is_whole = not result.is_floating_point() and not result.is_complex()
+    return RewardOutput(result.to(torch.float32) if is_whole else result)
+
+
+def _accepts(function: Callable[..., Any], count: int, settings: Mapping[str, Any], name: str) -> bool:
+    """Whether ``function`` takes ``count`` positional arguments and ``settings``; if not, it must take one fewer."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return True
+    for number in (count, count - 1):
+        try:
+            signature.bind(*[None] * number, **settings)
+        except TypeError:
+            continue
+        return number == count
+    raise InvalidInputError(
+        f"reward {name!r} has the signature {signature} and was given the settings {sorted(settings)}; "
+        "it must take (batch) or (batch, context), and its settings as keywords"
+    )
+
+
+_LOCAL = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)", re.DOTALL)
+_allowed: set[Path] = set()
+
+
+def is_local(reward: Any) -> bool:
+    """Whether a name of a reward names a function or class in a file.
+
+    >>> is_local("./my_rewards.py:clutter"), is_local("clutter")
+    (True, False)
+    """
+    return isinstance(reward, str) and _LOCAL.fullmatch(reward) is not None
+
+
+def local_files(reward: Any) -> list[Path]:
+    """The files whose code a reward would run, those of its parts included."""
+    found = (_LOCAL.fullmatch(name) for name in names_in(reward))
+    return sorted({Path(match["path"]).expanduser().resolve() for match in found if match})
+
+
+def names_in(reward: Any) -> Iterator[str]:
+    """All texts in a reward's name or mapping that may name a reward."""
+    if isinstance(reward, str):
+        yield reward
+    elif isinstance(reward, Mapping):
+        for value in reward.values():
+            yield from names_in(value)
+    elif isinstance(reward, list | tuple):
+        for value in reward:
+            yield from names_in(value)
+
+
+def allow_local_rewards(path: str | Path) -> None:
+    """Let ``reward="PATH.py:NAME"`` run the file ``path``. Every other file is refused."""
+    _allowed.add(Path(path).expanduser().resolve())
+
+
+def allowed_files() -> list[Path]:
+    """The files that may be run."""
+    return sorted(_allowed)
+
+
+def load_local(reward: str) -> Callable[..., Any]:
+    """The function or class that ``PATH.py:NAME`` names; runs the file once per process.
+
+    Raises:
+        InvalidInputError: the file was not allowed, does not exist, or has no callable of that name.
+        RewardError: the file cannot be run.
+    """
+    match = _LOCAL.fullmatch(reward)
+    assert match is not None
+    path = Path(match["path"]).expanduser().resolve()
+    if path not in _allowed:
+        raise InvalidInputError(
+            f"reward {reward!r} would run the file {str(path)!r}, which was not allowed: give --allow-local on the "
+            "command line, or call rewards.allow_local_rewards(path) in Python"
+        )
+    if not path.is_file():
+        raise InvalidInputError(f"reward {reward!r}: there is no file {str(path)!r}")
+    key = f"local_rewards_{hashlib.blake2b(str(path).encode(), digest_size=8).hexdigest()}"
+    if key not in sys.modules:
+        spec = spec_from_file_location(key, path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = module_from_spec(spec)
+        sys.modules[key] = module
+        try:
+            spec.loader.exec_module(module)
+        except KeyboardInterrupt:
+            del sys.modules[key]
+            raise
+        except BaseException as error:
+            del sys.modules[key]
+            raise RewardError(
+                f"reward {reward!r}: the file cannot be run: {type(error).__name__}: {str(error)[:300]}"
+            ) from error
+    found = getattr(sys.modules[key], match["name"], None)
+    if not callable(found):
+        raise InvalidInputError(f"reward {reward!r}: {str(path)!r} has no function or class {match['name']!r}")
+    return found  # type: ignore[no-any-return]
+
 
 ENTRY_POINT_GROUP = "scene_envs.rewards"
 """Entry-point group under which packages register rewards; the entry's name is the reward's name."""

@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 
 from rewards.base import RewardContext, RewardOutput
+from rewards.feasible import verdicts
 from rewards.registry import register_reward
-from rewards.verdicts import verdicts
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 

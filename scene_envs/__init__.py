@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from scene_envs.lazy import lazy_names
-from scene_envs.registration import register_envs
+from scene_envs.registry import lazy_names, register_envs
 
 if TYPE_CHECKING:
     from scene_envs.assets import list_assets, load_library

@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+import base64
+import contextlib
 import errno
 import hashlib
 import json
 import math
 import os
+import re
 import secrets
+import socket
+import threading
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
+from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from scene_envs.errors import CorruptFileError, StorageError
+from torch import Tensor
+
+from scene_envs.errors import CorruptFileError, InvalidInputError, StorageError
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+
 
 DIGEST = "sha256"
 """Key of a JSON file that holds the digest of all other keys and their values."""
@@ -160,3 +174,267 @@ def finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+LOCK = ".writer.lock"
+_BEAT, _SILENCE = 15, 60
+"""Seconds between two signs of life of a writer, and seconds without a sign of life after which a writer on another
+computer counts as ended."""
+_PARTIAL = re.compile(r"\..*?\.(?P<process>\d+)(\.\w+)?\.partial")
+_held: set[Path] = set()
+_guard = threading.Lock()
+
+
+@contextmanager
+def claimed(folder: str | os.PathLike[str], owner: str) -> Iterator[Path]:
+    """Context in which this process alone writes into ``folder``, which is made if it is missing.
+
+    The claim ends with the process, even if it is killed, and may be repeated by the same process. Half-written files
+    of killed processes in the folder are removed.
+
+    Args:
+        folder: Folder to write into.
+        owner: Name of the writer, for the error message of other processes.
+
+    Raises:
+        InvalidInputError: another process writes into the folder (it is named), or ``folder`` is a file.
+        StorageError: the folder cannot be made or written to.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as parent, claimed(Path(parent) / "run", "a test") as folder:
+    ...     [path.name for path in folder.iterdir()]
+    ['.writer.lock']
+    """
+    folder = Path(folder)
+    key = Path(os.path.realpath(folder))
+    with _guard:
+        again = key in _held
+        _held.add(key)
+    if again:
+        yield folder
+        return
+    lock = -1
+    try:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = _lock(folder / LOCK, owner)
+            sweep(folder)
+        except (FileExistsError, NotADirectoryError):
+            raise InvalidInputError(f"output={str(folder)!r} is a file, not a folder; give another") from None
+        except StorageError:
+            raise
+        except OSError as error:
+            raise storage_error(folder, error) from error
+        with _heartbeat(lock):
+            yield folder
+    finally:
+        with _guard:
+            _held.discard(key)
+        if lock >= 0:
+            with contextlib.suppress(OSError):
+                (folder / LOCK).unlink(missing_ok=True)
+            os.close(lock)
+
+
+def sweep(folder: Path) -> None:
+    """Remove files that ended processes left half-written in ``folder`` and its subfolders."""
+    for path in folder.rglob(".*.partial"):
+        found = _PARTIAL.fullmatch(path.name)
+        if found is None or int(found["process"]) == os.getpid() or not _is_alive(int(found["process"])):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+def _lock(path: Path, owner: str) -> int:
+    """The descriptor of the locked file; the operating system releases the lock when the process ends."""
+    import fcntl
+
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            writer = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
+            os.close(descriptor)
+            if error.errno in (errno.EAGAIN, errno.EACCES):
+                raise InvalidInputError(
+                    f"{str(path.parent)!r} is being written by {writer or 'another process'}; wait until it is done, "
+                    f"or give another output{_takeover(writer, path)}"
+                ) from None
+            raise
+        if (foreign := _owner_elsewhere(descriptor)) is not None:
+            os.close(descriptor)
+            raise InvalidInputError(
+                f"{str(path.parent)!r} is being written by {foreign}, whose last sign of life is less than "
+                f"{_SILENCE} s old; give another output, or, if that computer was switched off, wait a minute or "
+                f"remove {str(path)!r}"
+            )
+        with contextlib.suppress(FileNotFoundError):
+            if os.fstat(descriptor).st_ino == os.stat(path).st_ino:  # it was not removed meanwhile
+                text = f"{owner}, process {os.getpid()} on {socket.gethostname()}, since {time.strftime('%F %T')}"
+                os.truncate(descriptor, 0)
+                os.pwrite(descriptor, text.encode(), 0)
+                return descriptor
+        os.close(descriptor)
+
+
+def _takeover(writer: str, path: Path) -> str:
+    elsewhere = writer and f" on {socket.gethostname()}, since" not in writer
+    return f"; if that computer was switched off, remove {str(path)!r}" if elsewhere else ""
+
+
+def _owner_elsewhere(descriptor: int) -> str | None:
+    """The owner of the lock if it is on another computer and gave a recent sign of life; else None.
+
+    A file system may share files between computers without their locks.
+    """
+    writer = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
+    found = re.search(r"process \d+ on (.+), since", writer)
+    recent = time.time() - os.fstat(descriptor).st_mtime < _SILENCE
+    return writer if found is not None and found[1] != socket.gethostname() and recent else None
+
+
+@contextmanager
+def _heartbeat(descriptor: int) -> Iterator[None]:
+    """Context that sets the lock file's modification time to now every few seconds, as a sign of life."""
+    done = threading.Event()
+
+    def beat() -> None:
+        while not done.wait(_BEAT):
+            with contextlib.suppress(OSError):
+                os.utime(descriptor)
+
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+@cache
+def page_part(package: str, name: str) -> str:
+    """The text of a file in the folder of ``package``."""
+    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
+
+
+@cache
+def page_template(package: str, name: str, *, trim_blocks: bool = False) -> Template:
+    """The template in a file in the folder of ``package``.
+
+    The template escapes all text. Its filter ``png`` gives the bytes of the file at a path in base 64.
+    """
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=trim_blocks, keep_trailing_newline=not trim_blocks
+    )
+    environment.filters["png"] = lambda path: base64.b64encode(path.read_bytes()).decode("ascii")
+    return environment.from_string(page_part(package, name))
+
+
+def write_tensors(
+    path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
+) -> Path:
+    """Write tensors to one file, whole or not at all.
+
+    Args:
+        path: Path of the file.
+        tensors: Tensors by name, on any device.
+        metadata: Texts by name, kept in the same file.
+
+    Raises:
+        StorageError: the file cannot be written; nothing is left of it.
+    """
+    from safetensors.torch import save
+
+    path = Path(path)
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    kept = dict(metadata or {})
+    content = _in_order(save(plain, {**kept, DIGEST: tensors_digest(plain, kept)}))
+    with replacing(path) as partial, partial.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    path.with_name(f"{path.name}.{DIGEST}").unlink(missing_ok=True)  # the digest of the replaced file
+    return path
+
+
+def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a file, on the CPU; a file of another program, without a digest, is read as it is.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        CorruptFileError: the file is truncated, no safetensors file, or was changed.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    check_digest_file(path)
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except FileNotFoundError:
+        raise
+    except (SafetensorError, OSError, ValueError, RuntimeError, MemoryError) as error:
+        raise CorruptFileError(
+            f"{str(path)!r} is truncated or not a safetensors file ({_short(error)}); copy it again or make it anew"
+        ) from error
+    digest = metadata.pop(DIGEST, None)
+    if digest is not None and digest != tensors_digest(tensors, metadata):
+        raise CorruptFileError(_changed(path))
+    return tensors, metadata
+
+
+def check_digest_file(path: Path) -> None:
+    """Verify a file against the digest in the file ``<name>.sha256`` in its folder, if there is one.
+
+    Raises:
+        CorruptFileError: the digests differ.
+    """
+    digest_file = path.with_name(f"{path.name}.{DIGEST}")
+    if not digest_file.is_file() or not path.is_file():
+        return
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    if found not in digest_file.read_text(encoding="utf-8", errors="replace").split():
+        raise CorruptFileError(_changed(path))
+
+
+def _in_order(content: bytes) -> bytes:
+    """The same file with its header sorted: equal contents make equal bytes."""
+    size = int.from_bytes(content[:8], "little")
+    header = json.dumps(json.loads(content[8 : 8 + size]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + content[8 + size :]
+
+
+def tensors_digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> str:
+    """SHA-256 of tensors on the CPU, by name, and of their metadata."""
+    import torch
+
+    digest = hashlib.new(DIGEST, json.dumps(sorted((metadata or {}).items())).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _changed(path: Path) -> str:
+    return f"{str(path)!r} is damaged: its contents are not what was written (checksum); copy it again or make it anew"
+
+
+def _short(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]

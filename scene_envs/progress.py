@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import contextlib
+import os
+import sys
+from collections.abc import Collection, Iterator
 from time import perf_counter
 from types import TracebackType
+from typing import Any
 
-from scene_envs.errors import unknown_name
+from scene_envs.errors import MissingDependencyError, unknown_name
 
 STYLES = ("bar", "lines", "none")
 """Styles of progress; where there is no terminal, a bar becomes lines."""
@@ -83,3 +87,30 @@ class Progress:
         if self._prints and line and (now - self._printed >= self.every or done in self.always):
             self._printed = now
             self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+@contextlib.contextmanager
+def silence() -> Iterator[None]:
+    """Keep the message that PyBullet prints on import out of the user's terminal."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with open(os.devnull, "w") as sink:
+        kept = os.dup(1), os.dup(2)
+        try:
+            os.dup2(sink.fileno(), 1)
+            os.dup2(sink.fileno(), 2)
+            yield
+        finally:
+            for copy, descriptor in zip(kept, (1, 2), strict=True):
+                os.dup2(copy, descriptor)
+                os.close(copy)
+
+
+def quiet_pybullet(otherwise: str) -> Any:
+    """The module pybullet; raises MissingDependencyError with the text ``otherwise`` where it is not installed."""
+    try:
+        with silence():
+            import pybullet
+    except ImportError as error:
+        raise MissingDependencyError(otherwise) from error
+    return pybullet

@@ -12,7 +12,9 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from agents.configuration import (
+from docstring_parser import DocstringStyle, parse
+
+from agents.configuration.composition import (
     as_command_line_text,
     build,
     by_hydra,
@@ -26,9 +28,30 @@ from agents.configuration import (
     plain_tree,
     reason_of,
 )
-from agents.prior_names import adapted_name
-from agents.utils.docstrings import attribute_meanings
+from agents.configuration.prior_names import adapted_name
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
+
+
+def attribute_meanings(cls: type) -> dict[str, str]:
+    """Field name to sentence, from ``Attributes:`` in the Google-style docstrings of a class and its base classes.
+
+    >>> class Size:
+    ...     '''Extent.
+    ...
+    ...     Attributes:
+    ...         height: extent along z, in
+    ...             ``metres``.
+    ...     '''
+    >>> attribute_meanings(Size)
+    {'height': 'extent along z, in metres.'}
+    """
+    meanings: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        for entry in parse(inspect.cleandoc(base.__doc__ or ""), style=DocstringStyle.GOOGLE).params:
+            if entry.args[0] == "attribute":
+                meanings[entry.arg_name] = " ".join((entry.description or "").replace("``", "").split())
+    return meanings
+
 
 _FIRST = ("scene", "prior", "scenes", "data", "reward", "objective", "count")
 """Keys that a listing starts with, in this order."""

@@ -21,9 +21,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import torch
+
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import Sources, compose, format_rows, help_text, keys_of
-from agents.configuration import (
+from agents.configuration.composition import (
     PROGRESS_STYLES,
     config_text,
     known_masks,
@@ -31,7 +33,7 @@ from agents.configuration import (
     known_scenes,
     require_one_of,
 )
-from agents.prior_names import find_prior, split_name
+from agents.configuration.prior_names import find_prior, split_name
 from agents.utils.interrupts import Terminated, terminable
 from scene_envs import __version__
 from scene_envs.errors import (
@@ -208,13 +210,11 @@ def _check(settings: Any, allow_local: bool, only_show: bool, module: ModuleType
     if isinstance(seed := getattr(settings, "seed", 0), int) and not 0 <= seed < 2**63:
         raise InvalidInputError(f"seed={seed} must be from 0 to 2^63 - 1")
     if isinstance(device := getattr(settings, "device", "cpu"), str) and device != "cpu":
-        from agents.utils.devices import check_device
-
         check_device(device)
 
 
 def _ask_for_files(key: str, reward: Any, allow_local: bool) -> None:
-    from rewards.local_files import allow_local_rewards, allowed_files, local_files
+    from rewards.registry import allow_local_rewards, allowed_files, local_files
 
     for path in local_files(reward):
         if path in allowed_files():
@@ -458,7 +458,7 @@ def _check_guidance(settings: Any) -> None:
     if not math.isfinite(guidance):
         raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
     if hasattr(settings, "prompt") and (guidance or prompt is not None):
-        from agents.post_training.config import check_prompt
+        from agents.post_training.settings import check_prompt
 
         check_prompt(prompt, guidance)
     if strength := getattr(settings, "claim_guidance", 0.0):
@@ -475,3 +475,24 @@ def _dotted(settings: Any, key: str) -> Any:
     for part in key.split("."):
         settings = getattr(settings, part, None)
     return settings
+
+
+def check_device(name: str) -> None:
+    """Raise unless torch knows the device and this machine has it.
+
+    Raises:
+        InvalidInputError: the device cannot be used; the message says which would work.
+
+    >>> check_device("cpu")
+    """
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except Exception:  # each backend has errors of its own
+        here = ["cpu"]
+        here += [f"cuda:{index}" for index in range(torch.cuda.device_count())]
+        raise InvalidInputError(
+            f"device={str(name)[:60]!r} is not a torch device of this machine; use one of {', '.join(here)}"
+        ) from None
+    if device.type == "meta":
+        raise InvalidInputError("device='meta' stores no data; give cpu or cuda")

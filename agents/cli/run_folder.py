@@ -12,11 +12,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from agents.configuration import config_text, dotted
+from agents.configuration.composition import config_text, dotted
 from agents.utils.process_group import is_first_process, launched_processes
 from scene_envs.errors import CorruptFileError, InvalidInputError
-from scene_envs.files import read_sealed, sealed, storage_error, write_json, write_text
-from scene_envs.folders import claimed
+from scene_envs.files import claimed, read_sealed, sealed, storage_error, write_json, write_text
 
 _PACKAGES = ("scene_envs", "rewards", "agents")
 _RESULTS = (

@@ -3,14 +3,226 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from numbers import Integral
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from agents.diffusion.moments import Preconditioning
-from agents.diffusion.residual import ResidualVariance
-from agents.diffusion.schedules import NoiseSchedule
+from agents.diffusion.categorical import CategoricalProcess
 from scene_envs.errors import InvalidInputError, unknown_name
+
+_MIN_SLOTS = 20
+"""Smallest number of slots of a category from which its own moments are taken."""
+
+
+@dataclass(frozen=True)
+class CategoryMoments:
+    """Moments of normalised poses, category by category; the last of the K categories is *empty*.
+
+    Attributes:
+        share: (K,) frequency of each category among slots; sums to 1.
+        mean: (K, D).
+        std: (K, D), floored away from zero.
+    """
+
+    share: Tensor
+    mean: Tensor
+    std: Tensor
+
+    @classmethod
+    def fit(cls, poses: Tensor, categories: Tensor, count: int, floor: float = 1e-3) -> CategoryMoments:
+        """Moments of poses (M, D) whose categories are (M,) in 0..``count`` - 1.
+
+        A category with fewer than 20 slots takes the moments of all objects, because too small a standard deviation
+        makes the targets of poses far from the mean very large. *Empty* has the mean of all objects and the standard
+        deviation ``floor``.
+        """
+        poses = poses.double()
+        object_poses = poses[categories != count - 1]
+        mean, std = object_poses.mean(dim=0).repeat(count, 1), object_poses.std(dim=0).repeat(count, 1)
+        std[-1] = 0.0
+        for category in range(count - 1):
+            own = poses[categories == category]
+            if len(own) >= _MIN_SLOTS:
+                mean[category], std[category] = own.mean(dim=0), own.std(dim=0)
+        share = torch.bincount(categories, minlength=count).double() + 1e-3
+        return cls((share / share.sum()).float(), mean.float(), std.clamp(min=floor).float())
+
+    def given_state(self, process: CategoricalProcess) -> tuple[Tensor, Tensor]:
+        """E[x_0 | state at t] and its standard deviation, (T + 1, K + 1, D) each, K being the mask token.
+
+        A state may be wrong where the kernel replaces categories. So the moments follow from the laws of total
+        expectation and variance over the clean category, whose posterior follows from ``share`` by Bayes' rule.
+        """
+        categories = torch.arange(process.categories)
+        steps = process.schedule.num_timesteps + 1
+        levels = torch.arange(steps).repeat_interleave(process.categories)
+        likelihood = process.marginal(categories.repeat(steps), levels).view(steps, process.categories, -1)
+        joint = self.share.double()[:, None] * likelihood.double()  # (T + 1, K, K + 1)
+        total = joint.sum(dim=1, keepdim=True)
+        prior = self.share.double()[:, None].expand_as(joint)
+        clean = torch.where(total > 1e-12, joint / total.clamp(min=1e-12), prior).transpose(1, 2)  # (T + 1, K + 1, K)
+        mean = clean @ self.mean.double()
+        square = clean @ (self.std.double().square() + self.mean.double().square())
+        variance = (square - mean.square()).clamp(min=float(self.std.min()) ** 2)
+        return mean.float(), variance.sqrt().float()
+
+
+@dataclass(frozen=True)
+class Preconditioning:
+    """Per-feature first and second moments of normalised data.
+
+    Attributes:
+        mean: (D,) mean.
+        std: (D,) standard deviation, floored away from zero.
+        by_category: moments of each category; None if the process scales all categories alike.
+    """
+
+    mean: Tensor
+    std: Tensor
+    by_category: CategoryMoments | None = None
+
+    @classmethod
+    def fit(cls, data: Tensor, floor: float = 0.05) -> Preconditioning:
+        """Moments of normalised scenes (..., D)."""
+        flat = data.reshape(-1, data.shape[-1]).double()
+        return cls(flat.mean(dim=0).float(), flat.std(dim=0).clamp(min=floor).float())
+
+    def pooled(self) -> Preconditioning:
+        """One standard deviation for all features (their root mean square), as Karras et al. use."""
+        return Preconditioning(self.mean, self.std.square().mean().sqrt().expand_as(self.std).clone())
+
+    def state(self) -> dict[str, Any]:
+        """The moments as JSON."""
+        state: dict[str, Any] = {"mean": self.mean.tolist(), "std": self.std.tolist()}
+        if self.by_category is not None:
+            own = self.by_category
+            state["by_category"] = {"share": own.share.tolist(), "mean": own.mean.tolist(), "std": own.std.tolist()}
+        return state
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> Preconditioning:
+        """Inverse of :meth:`state`; raises KeyError on a missing entry, ValueError where entries cannot be moments."""
+        own = state.get("by_category")
+        by_category = (
+            None if own is None else CategoryMoments(*(torch.tensor(own[k]) for k in ("share", "mean", "std")))
+        )
+        mean, std = (torch.tensor(state[key], dtype=torch.float32) for key in ("mean", "std"))
+        known = [mean, std, *([] if by_category is None else (by_category.share, by_category.mean, by_category.std))]
+        if mean.shape != std.shape or mean.ndim != 1 or not all(bool(torch.isfinite(part).all()) for part in known):
+            raise ValueError("the moments of the preconditioning must be finite numbers, one mean and std per feature")
+        return cls(mean, std, by_category)
+
+
+@dataclass(frozen=True)
+class ResidualVariance:
+    """Mean squared error of the denoised scene, E (x_0 - x_0_hat(x_t))^2, per noise level and feature.
+
+    A chain that replaces x_0 by its estimate loses this much variance; with 25 strides of an exact denoiser of Gaussian
+    data, a fifth of the standard deviation. Adding it back gives the optimal reverse variance of Bao et al.
+    (Analytic-DPM, 2022), Theorem 1, here per feature.
+
+    Attributes:
+        timesteps: (G,) int64, the measured timesteps, increasing.
+        variance: (G, D) float32, mean squared errors at these timesteps.
+
+    >>> residual = ResidualVariance(torch.tensor([1, 3]), torch.tensor([[1.0], [4.0]]))
+    >>> residual.at(2)
+    tensor([2.])
+    """
+
+    timesteps: Tensor
+    variance: Tensor
+
+    def at(self, t: int) -> Tensor:
+        """(D,) error at timestep ``t``, interpolated geometrically between the measured levels."""
+        upper = int(torch.searchsorted(self.timesteps, t).clamp(max=len(self.timesteps) - 1))
+        lower = max(0, upper - 1)
+        span = int(self.timesteps[upper] - self.timesteps[lower])
+        weight = 0.0 if span == 0 else (t - int(self.timesteps[lower])) / span
+        log_variance = self.variance.clamp(min=1e-12).log()
+        return torch.lerp(log_variance[lower], log_variance[upper], min(1.0, max(0.0, weight))).exp()
+
+
+@dataclass(frozen=True)
+class NoiseSchedule:
+    """Cumulative signal rate of a variance-preserving diffusion, x_t = sqrt(a_t) x_0 + sqrt(1 - a_t) eps.
+
+    Attributes:
+        name: ``"karras"``, ``"linear"`` or ``"cosine"``.
+        alpha_bar: (T + 1,) float64, decreasing from 1 at t = 0.
+
+    >>> schedule = make_schedule("karras", 1000)
+    >>> round(float(schedule.noise_to_signal[1]), 4), round(float(schedule.noise_to_signal[1000]), 1)
+    (0.002, 80.0)
+    """
+
+    name: str
+    alpha_bar: Tensor
+
+    @property
+    def num_timesteps(self) -> int:
+        """T."""
+        return self.alpha_bar.shape[0] - 1
+
+    @property
+    def noise_to_signal(self) -> Tensor:
+        """(T + 1,) sigma of Karras et al. (2022), sqrt((1 - a_t) / a_t)."""
+        return ((1.0 - self.alpha_bar) / self.alpha_bar).sqrt()
+
+
+def karras_alpha_bar(num_timesteps: int, sigma_min: float = 0.002, sigma_max: float = 80.0, rho: float = 7.0) -> Tensor:
+    """(T + 1,) from noise levels spaced as in Karras et al. 2022, Eq. 5, from ``sigma_min`` at t = 1.
+
+    The lowest noise level is 0.002 of the data's unit, five times finer than with linear betas from 1e-4. An object
+    that stands and one that floats differ by a millimetre.
+    """
+    u = torch.linspace(0, 1, num_timesteps, dtype=torch.float64)
+    low, high = sigma_min ** (1 / rho), sigma_max ** (1 / rho)
+    sigma = (low + u * (high - low)) ** rho
+    return torch.cat([torch.ones(1, dtype=torch.float64), 1.0 / (1.0 + sigma**2)])
+
+
+def linear_alpha_bar(num_timesteps: int, beta_start: float = 1e-4, beta_end: float = 0.02) -> Tensor:
+    """(T + 1,) from linearly growing betas (Ho et al. 2020, section 4; the paper's schedule)."""
+    beta = torch.linspace(beta_start, beta_end, num_timesteps, dtype=torch.float64)
+    return torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1.0 - beta, dim=0)])
+
+
+def cosine_alpha_bar(num_timesteps: int, offset: float = 0.008, max_beta: float = 0.999) -> Tensor:
+    """(T + 1,) of the squared-cosine schedule (Nichol and Dhariwal 2021, Eq. 17), betas capped at ``max_beta``."""
+    t = torch.arange(num_timesteps + 1, dtype=torch.float64) / num_timesteps
+    f = torch.cos((t + offset) / (1 + offset) * math.pi / 2) ** 2
+    beta = (1.0 - f[1:] / f[:-1]).clamp(max=max_beta)
+    return torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1.0 - beta, dim=0)])
+
+
+_SCHEDULES: dict[str, Callable[[int], Tensor]] = {
+    "karras": karras_alpha_bar,
+    "linear": linear_alpha_bar,
+    "cosine": cosine_alpha_bar,
+}
+
+
+def make_schedule(
+    name: str, num_timesteps: int = 1000, noise_floor: float = 0.002, noise_ceiling: float = 80.0
+) -> NoiseSchedule:
+    """The schedule called ``name`` with ``num_timesteps`` levels; ``"karras"`` goes from floor to ceiling."""
+    if name not in _SCHEDULES:
+        raise unknown_name("noise schedule", name, _SCHEDULES)
+    if num_timesteps < 2:
+        raise InvalidInputError(f"a noise schedule needs at least 2 timesteps, got {num_timesteps}")
+    if name == "karras":
+        if not 0.0 < noise_floor < noise_ceiling:
+            raise InvalidInputError(
+                f"noise_floor={noise_floor:g} must be positive and below noise_ceiling={noise_ceiling:g}"
+            )
+        return NoiseSchedule(name, karras_alpha_bar(num_timesteps, noise_floor, noise_ceiling))
+    return NoiseSchedule(name, _SCHEDULES[name](num_timesteps))
+
 
 Moments = tuple[Tensor, Tensor]
 """Mean and standard deviation."""
@@ -214,3 +426,168 @@ def lognormal_timesteps(schedule: NoiseSchedule, mean: float, std: float) -> Ten
             f"schedule, whose levels are {float(log_sigma.min()):.3g} to {float(log_sigma.max()):.3g}"
         )
     return torch.cat([torch.zeros(1, dtype=weight.dtype), weight / total])
+
+
+@dataclass(frozen=True)
+class StepTable:
+    """Reverse steps as (t, t_prev) pairs.
+
+    Attributes:
+        timesteps: (S,) int64, strictly decreasing, within 1..T.
+        previous: (S,) int64, timestep at which each step ends; the last is 0, clean data.
+
+    >>> table = StepTable.spaced(1000, 4)
+    >>> table.timesteps.tolist(), table.previous.tolist()
+    ([1000, 667, 334, 1], [667, 334, 1, 0])
+    """
+
+    timesteps: Tensor
+    previous: Tensor
+
+    def __post_init__(self) -> None:
+        t, previous = self.timesteps, self.previous
+        chained = t.shape == previous.shape and len(t) > 0 and bool((t[1:] == previous[:-1]).all())
+        if not chained or int(previous[-1]) != 0 or not bool((t > previous).all()):
+            raise InvalidInputError(
+                f"a step table must decrease, chain and end at 0, got {t.tolist()} -> {previous.tolist()}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.timesteps)
+
+    @classmethod
+    def spaced(cls, num_timesteps: int, num_steps: int) -> StepTable:
+        """``num_steps`` steps evenly spaced over 1..T, both ends included; any number from 1 to T.
+
+        The timesteps are one above those of diffusers' schedulers with ``timestep_spacing="linspace"``, which count
+        from 0.
+
+        Args:
+            num_timesteps: number T of timesteps of the schedule.
+            num_steps: number S of steps; need not divide T.
+
+        Raises:
+            InvalidInputError: ``num_steps`` is not a whole number in 1..T.
+        """
+        if not isinstance(num_steps, Integral) or isinstance(num_steps, bool):
+            raise InvalidInputError(f"num_steps={num_steps!r} must be a whole number in 1..{num_timesteps}")
+        if not 1 <= num_steps <= num_timesteps:
+            raise InvalidInputError(f"num_steps={num_steps} is outside 1..{num_timesteps}, the prior's timesteps")
+        if num_steps == 1:
+            t = torch.tensor([num_timesteps])
+        else:
+            t = torch.linspace(num_timesteps - 1, 0, num_steps, dtype=torch.float64).round().long() + 1
+        return cls(t, torch.cat([t[1:], torch.zeros(1, dtype=torch.int64)]))
+
+    @classmethod
+    def gradual(cls, masked: Tensor, slots: int, num_steps: int) -> StepTable:
+        """``num_steps`` steps, the first of which unmask about one slot each.
+
+        The first k = min(num_steps // 2, num_steps - 25) steps unmask about one slot each; the rest are evenly spaced.
+        Slots that are unmasked in one step are drawn independently, and the first slots determine the kind of scene.
+
+        Args:
+            masked: (T + 1,) share of masked slots at each timestep of an absorbing chain, non-decreasing.
+            slots: number N of slots of a scene.
+            num_steps: number S of steps, from 1 to T.
+
+        >>> StepTable.gradual(torch.linspace(0, 1, 1001), 100, 30).timesteps[:8].tolist()
+        [1000, 990, 980, 971, 961, 951, 911, 872]
+        """
+        num_timesteps = len(masked) - 1
+        even = cls.spaced(num_timesteps, num_steps)
+        single = max(0, min(num_steps // 2, num_steps - 25))
+        shares = 1.0 - torch.arange(single + 1, dtype=torch.float64) / slots
+        first = torch.searchsorted(masked.double().cpu(), shares.clamp(min=0.0))  # the earliest level with that share
+        first = first[(first >= even.timesteps[: len(first)])].unique().flip(0)
+        rest = num_steps - len(first)
+        if len(first) < 2 or rest < 1 or int(first[-1]) - 1 < rest:
+            return even
+        later = torch.linspace(int(first[-1]), 1, rest + 1, dtype=torch.float64).round().long()[1:]
+        return cls.from_timesteps([*first.tolist(), *later.tolist()], num_timesteps)
+
+    @classmethod
+    def from_timesteps(cls, timesteps: Sequence[int], num_timesteps: int | None = None) -> StepTable:
+        """Table of timesteps in decreasing order; the last step ends at 0.
+
+        Args:
+            timesteps: timesteps in 1..T, such as those of another library.
+            num_timesteps: T, against which the timesteps are checked; a process refuses timesteps above its own T.
+
+        Raises:
+            InvalidInputError: the timesteps are not in decreasing order, or outside 1..T.
+        """
+        t = torch.tensor(timesteps, dtype=torch.int64)
+        if num_timesteps is not None and len(t) and not 1 <= int(t.min()) <= int(t.max()) <= num_timesteps:
+            raise InvalidInputError(
+                f"timesteps {int(t.min())}..{int(t.max())} are outside 1..{num_timesteps}, the prior's timesteps"
+            )
+        return cls(t, torch.cat([t[1:], torch.zeros(1, dtype=torch.int64)]))
+
+
+LOSS_WEIGHTINGS = ("none", "min_snr")
+"""Weightings of the squared error by timestep; see :func:`loss_weights`."""
+
+MIN_SNR_GAMMA = 5.0
+"""Gamma of Hang et al. (2023), section 3.4: the largest signal-to-noise ratio in the weight."""
+
+
+def check_weighting(kind: str, prediction: str) -> None:
+    """Raise when ``kind`` is not a weighting, or does not go with ``prediction``.
+
+    Raises:
+        UnknownNameError: a name is not known.
+        InvalidInputError: ``"min_snr"`` with ``"edm"`` prediction, whose target already weighs the levels.
+    """
+    if kind not in LOSS_WEIGHTINGS:
+        raise unknown_name("loss weighting", kind, LOSS_WEIGHTINGS)
+    check_prediction(prediction)
+    if kind == "min_snr" and prediction == "edm":
+        raise InvalidInputError(
+            "loss_weighting='min_snr' does not go with prediction='edm', whose target has unit variance at every "
+            "level already; use loss_weighting='none', or prediction 'epsilon', 'v' or 'x0'"
+        )
+
+
+def loss_weights(
+    schedule: NoiseSchedule, t: Tensor, prediction: str, kind: str, gamma: float = MIN_SNR_GAMMA
+) -> Tensor:
+    """(B,) float32 weights of the mean squares of the network's error at timesteps ``t``.
+
+    ``"none"`` is 1 everywhere. ``"min_snr"`` (Hang et al. 2023, Eq. 8) gives the error of the clean scene the weight
+    min(SNR, gamma), SNR being alpha_t^2 / sigma_t^2. The squared error of the noise is SNR times that of the
+    clean scene, and the squared error of v is SNR + 1 times that of the clean scene. So their weights are
+    min(SNR, gamma) / SNR and min(SNR, gamma) / (SNR + 1).
+
+    Args:
+        schedule: noise schedule.
+        t: (B,) int64 in 1..T.
+        prediction: one of :data:`~agents.diffusion.gaussian.PREDICTIONS`.
+        kind: one of :data:`LOSS_WEIGHTINGS`.
+        gamma: largest signal-to-noise ratio in the weight.
+
+    Raises:
+        UnknownNameError, InvalidInputError: the errors of :func:`check_weighting`.
+
+    >>> from agents.diffusion.gaussian import make_schedule
+    >>> loss_weights(make_schedule("linear"), torch.tensor([1, 1000]), "x0", "min_snr").tolist()[0]
+    5.0
+    """
+    check_weighting(kind, prediction)
+    if kind == "none":
+        return torch.ones(t.shape, device=t.device)
+    alpha_bar = schedule.alpha_bar[t.cpu()]
+    snr = alpha_bar / (1.0 - alpha_bar)
+    over = {"epsilon": snr, "v": snr + 1.0, "x0": torch.ones_like(snr)}[prediction]
+    return (snr.clamp(max=gamma) / over).float().to(t.device)
+
+
+def timestep_distribution(timesteps: str | None, prediction: str) -> str:
+    """The distribution of training timesteps: the given one, or the one published with ``prediction``.
+
+    >>> timestep_distribution(None, "epsilon"), timestep_distribution(None, "edm")
+    ('uniform', 'lognormal')
+    >>> timestep_distribution("lognormal", "v")
+    'lognormal'
+    """
+    return timesteps or ("lognormal" if prediction == "edm" else "uniform")

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from agents.diffusion.unmasking import draw_unmasked, systematic, unmasking_log_prob
+from agents.diffusion.categorical import draw_unmasked, systematic, unmasking_log_prob
 
 _TINY = 1e-30
 
@@ -117,7 +117,7 @@ class MixedStep(NamedTuple):
         probs: (B, N, K + 1) of the state, the mask token last.
         random: (N,) bool, slots whose state is drawn; in the others the likeliest one is taken.
         masked: (B, N) bool, masked slots that are unmasked together, so that their number is near the expected one
-            (:mod:`agents.diffusion.unmasking`); None unmasks each slot independently.
+            (:mod:`agents.diffusion.categorical`); None unmasks each slot independently.
         denoised: (B, N, P + K) the denoiser's estimate of x_0, categories by arg-max, where it is known.
         groups: (B, K) int64, the group of each category. Slots that are unmasked together draw groups by systematic
             sampling, so that the number of each group is near the expected one. Then they draw categories within the

@@ -1,17 +1,11 @@
 """Evaluation: measures of scenes against real scenes."""
 
-from agents.evaluation.classifier import classifier_accuracy
-from agents.evaluation.frechet import frechet_scene_distance
-from agents.evaluation.inception import frechet_inception_distance
-from agents.evaluation.measure import evaluate, grammar_scenes, measure_samples
-from agents.evaluation.novelty import nearest_scenes, novelty
+from agents.evaluation.classifier import Accuracy, ClassifierConfig, classifier_accuracy
+from agents.evaluation.layouts import nearest_scenes, novelty, spacing_wasserstein, stack_wasserstein, tallest_stacks
+from agents.evaluation.measure import evaluate, figure_table, grammar_scenes, measure_samples
 from agents.evaluation.physics_figures import physics_figures, stable_fraction
+from agents.evaluation.pictures import frechet_inception_distance, frechet_scene_distance, render_classifier_accuracy
 from agents.evaluation.prompt_following import own_prompts, prompt_following
-from agents.evaluation.render_classifier import render_classifier_accuracy
-from agents.evaluation.report import figure_table
-from agents.evaluation.spacing import spacing_wasserstein
-from agents.evaluation.stacks import stack_wasserstein, tallest_stacks
-from agents.evaluation.two_sample_test import Accuracy, ClassifierConfig
 
 __all__ = [
     "Accuracy",

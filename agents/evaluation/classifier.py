@@ -2,26 +2,188 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from agents.evaluation.scene_tokens import SceneTokens, blurred, scene_tokens
-from agents.evaluation.set_network import SetNetwork
-from agents.evaluation.two_sample_test import (
-    MIN_SCENES,
-    Accuracy,
-    ClassifierConfig,
-    Forward,
-    Split,
-    check_classes,
-    two_sample_accuracy,
-)
-from agents.evaluation.typical_places import TypicalPlaces
+from agents.evaluation.set_network import SceneTokens, SetNetwork, TypicalPlaces, blurred, scene_tokens
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_distance import check_same_assets
+
+MIN_SCENES = 20
+"""Smallest number of scenes of each class with which a classifier is trained."""
+
+_STOP_LOSS = 5e-3
+"""Validation loss (nats) below which training stops, because the classifier separates the classes."""
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Accuracy of a classifier of real scenes and samples; 0.5 is chance, 1 is always right.
+
+    Attributes:
+        mean: mean over the seeds.
+        std: population standard deviation over the seeds.
+        per_seed: accuracy of each seed on its held-out scenes.
+
+    >>> Accuracy.of([0.5, 0.75])
+    Accuracy(mean=0.625, std=0.125, per_seed=(0.5, 0.75))
+    """
+
+    mean: float
+    std: float
+    per_seed: tuple[float, ...]
+
+    @classmethod
+    def of(cls, per_seed: Sequence[float]) -> Accuracy:
+        """From the accuracies of at least one seed."""
+        values = torch.tensor(per_seed, dtype=torch.float64)
+        return cls(float(values.mean()), float(values.std(correction=0)), tuple(per_seed))
+
+
+@dataclass(frozen=True)
+class ClassifierConfig:
+    """Settings of the training and test of a classifier.
+
+    Attributes:
+        train_fraction: share of training scenes in each class.
+        validation_fraction: share of validation scenes, which decide when training stops; the rest is held out.
+        max_train: largest number of training scenes of each class.
+        max_validation: largest number of validation scenes of each class.
+        epochs: largest number of passes over the training part.
+        patience: number of epochs without a better validation loss after which training stops.
+        batch_size: number of scenes per step.
+        learning_rate: largest learning rate of the one-cycle schedule of AdamW.
+        weight_decay: weight decay of AdamW.
+    """
+
+    train_fraction: float = 0.5
+    validation_fraction: float = 0.15
+    max_train: int = 1000
+    max_validation: int = 250
+    epochs: int = 8
+    patience: int = 3
+    batch_size: int = 64
+    learning_rate: float = 4e-3
+    weight_decay: float = 0.02
+
+    def __post_init__(self) -> None:
+        if self.train_fraction <= 0 or self.validation_fraction <= 0:
+            raise InvalidInputError(
+                f"train_fraction={self.train_fraction} and validation_fraction={self.validation_fraction} "
+                "must be positive"
+            )
+        if self.train_fraction + self.validation_fraction >= 1:
+            raise InvalidInputError(
+                f"train_fraction={self.train_fraction} and validation_fraction={self.validation_fraction} "
+                "leave nothing to hold out; their sum must be below 1"
+            )
+        for name in ("max_train", "max_validation", "epochs", "patience", "batch_size"):
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Split:
+    """Rows of the training, validation and held-out parts; both classes are equally frequent in each."""
+
+    train: Tensor
+    validation: Tensor
+    held_out: Tensor
+
+
+Forward = Callable[[nn.Module, Tensor], Tensor]
+"""From a network and rows (R,) to logits (R,)."""
+
+Prepare = Callable[[Split], tuple[nn.Module, Forward]]
+"""From a split to an untrained network and the function that reads rows; all fitting is on the training part."""
+
+
+def check_classes(real: int, fake: int, seeds: int) -> None:
+    """Raise InvalidInputError unless there are enough scenes of each class, and seeds."""
+    if min(real, fake) < MIN_SCENES:
+        raise InvalidInputError(
+            f"a classifier needs at least {MIN_SCENES} real scenes and samples each, got {real} and {fake}"
+        )
+    if seeds < 1:
+        raise InvalidInputError(f"seeds must be at least 1, got {seeds}")
+
+
+def two_sample_accuracy(
+    real: int, fake: int, prepare: Prepare, *, seeds: int, seed: int, config: ClassifierConfig
+) -> Accuracy:
+    """Train and test one classifier per seed.
+
+    Rows 0 … real - 1 are real scenes, the following ``fake`` rows are samples. The larger class is subsampled to the
+    size of the smaller one.
+
+    Args:
+        real: number of real scenes.
+        fake: number of samples.
+        prepare: function that makes the classifier of a split.
+        seeds: number of repetitions, each with a split, weights and order of its own.
+        seed: seed of the first repetition.
+        config: settings of the training and test.
+    """
+    check_classes(real, fake, seeds)
+    labels = torch.cat([torch.ones(real), torch.zeros(fake)])
+    scores = []
+    for number in range(seed, seed + seeds):
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(number)
+            split = _split(real, fake, config)
+            network, forward = prepare(split)
+            _train(network, forward, labels, split, config)
+            right = (_logits(network, forward, split.held_out, config) > 0) == (labels[split.held_out] > 0.5)
+        scores.append(float(right.double().mean()))
+    return Accuracy.of(scores)
+
+
+def _split(real: int, fake: int, config: ClassifierConfig) -> Split:
+    count = min(real, fake)
+    rows = [torch.randperm(real)[:count], real + torch.randperm(fake)[:count]]
+    train = min(round(config.train_fraction * count), config.max_train)
+    end = train + max(1, min(round(config.validation_fraction * count), config.max_validation))
+    parts = (slice(train), slice(train, end), slice(end, None))
+    return Split(*(torch.cat([of_class[part] for of_class in rows]) for part in parts))
+
+
+def _train(network: nn.Module, forward: Forward, labels: Tensor, split: Split, config: ClassifierConfig) -> None:
+    """Leave the network with the weights of the epoch whose validation loss is lowest."""
+    steps = math.ceil(len(split.train) / config.batch_size)
+    optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=config.weight_decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=config.epochs * steps)
+    best, best_state, since = math.inf, {name: value.clone() for name, value in network.state_dict().items()}, 0
+    for _ in range(config.epochs):
+        network.train()
+        for rows in split.train[torch.randperm(len(split.train))].split(config.batch_size):
+            loss = F.binary_cross_entropy_with_logits(forward(network, rows), labels[rows])
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimizer.step()
+            schedule.step()
+        logits = _logits(network, forward, split.validation, config)
+        value = float(F.binary_cross_entropy_with_logits(logits, labels[split.validation]))
+        since += 1
+        if value < best:
+            best, since = value, 0
+            best_state = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+        if since >= config.patience or value < _STOP_LOSS:
+            break
+    network.load_state_dict(best_state)
+
+
+@torch.no_grad()
+def _logits(network: nn.Module, forward: Forward, rows: Tensor, config: ClassifierConfig) -> Tensor:
+    network.eval()
+    return torch.cat([forward(network, part) for part in rows.split(4 * config.batch_size)])
+
 
 RESOLUTION = (1e-3, 1e-2)
 """Standard deviation (m, rad) of the noise that is added to both classes: the largest motion of a feasible object."""

@@ -2,10 +2,26 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from agents.configuration.composition import MEASURE_NAMES
+from agents.evaluation.layouts import (
+    Neighbors,
+    duplicates,
+    nearest_scenes,
+    novelty,
+    spacing_wasserstein,
+    stack_wasserstein,
+    tallest_stacks,
+)
 from agents.evaluation.metrics import (
     category_kl,
     count_wasserstein,
@@ -13,17 +29,16 @@ from agents.evaluation.metrics import (
     out_of_workspace_rate,
     workspace_fraction,
 )
-from agents.evaluation.novelty import duplicates
 from agents.evaluation.physics_figures import physics_figures, ready_figures
-from agents.evaluation.spacing import spacing_wasserstein
-from agents.evaluation.stacks import stack_wasserstein, tallest_stacks
-from scene_envs.envs.resolvers import resolve_prior
-from scene_envs.errors import InvalidInputError
+from agents.evaluation.prompt_following import CHANCE_PREFIX, own_prompts, prompt_chance, prompt_following
+from scene_envs.envs.scoring import resolve_prior
+from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
+
 
 FLOOR_PREFIX = "floor_"
 """Prefix of the figures of real scenes measured against other real scenes."""
@@ -157,3 +172,367 @@ def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]
             figures[f"height_error_{kind}_mm"] = 1e3 * float(errors.quantile(0.5))
             figures[f"height_error_{kind}_p95_mm"] = 1e3 * float(errors.quantile(0.95))
     return figures
+
+
+_FLOOR_SEED = 1_000_003
+"""Added to the seed of the grammar for the second set of scenes."""
+
+
+@dataclass(frozen=True)
+class RealScenes:
+    """Disjoint sets of real scenes.
+
+    Attributes:
+        reference: held-out scenes with which samples are compared.
+        floor: other held-out scenes, equivalent to samples of a perfect sampler.
+        training: scenes on which the prior may have been trained; None if the other scenes are from the grammar.
+
+    >>> from scene_envs.scene_types import get_scene_type
+    >>> real = RealScenes.load(get_scene_type("dimsum_table"), 2)
+    >>> len(real.reference), len(real.floor), real.training
+    (2, 2, None)
+    """
+
+    reference: SceneBatch
+    floor: SceneBatch
+    training: SceneBatch | None = None
+
+    @classmethod
+    def load(
+        cls, scene_type: SceneType, count: int, *, data: str = "", heldout: str = "", training: int = 20_000,
+        seed: int = 0,
+    ) -> RealScenes:  # fmt: skip
+        """Held-out scenes, at most ``count`` in each of the two sets, and training scenes.
+
+        Args:
+            scene_type: scene type of the samples.
+            count: largest number of scenes in ``reference`` and in ``floor``.
+            data: dataset folder of the training scenes, or several joined by commas for a prior of their union;
+                empty takes fresh scenes of the grammar, and no training scenes.
+            heldout: dataset folder, or folders, of held-out scenes; empty takes the last scenes of ``data``, at most
+                half of it.
+            training: number of training scenes, drawn at random.
+            seed: seed of the grammar and of the draw.
+
+        Raises:
+            InvalidInputError: a folder does not exist, its scenes are of another type, there are fewer than four
+                held-out scenes, or a number is below 1.
+            CorruptFileError: a file cannot be read, lacks a column, or holds rows that are not scenes.
+        """
+        if count < 2 or training < 1:
+            raise InvalidInputError(
+                f"an evaluation needs count >= 2 and training_scenes >= 1, got count={count} and "
+                f"training_scenes={training}"
+            )
+        if not data:
+            if heldout:
+                raise InvalidInputError(f"heldout={heldout!r} needs data=, the folder of the training scenes")
+            return cls(
+                grammar_scenes(scene_type, count, seed), grammar_scenes(scene_type, count, seed + _FLOOR_SEED), None
+            )
+        folders, held_folders = _folders(data), _folders(heldout)
+        if heldout and len(held_folders) != len(folders):
+            raise InvalidInputError(
+                f"data names {len(folders)} folders and heldout {len(held_folders)}; give the same number"
+            )
+        share = -(-count // len(folders))
+        parts = [
+            _split(folder, held, scene_type, share, -(-training // len(folders)), seed)
+            for folder, held in zip(folders, held_folders or [""] * len(folders), strict=True)
+        ]
+        slots = max(part.tensor.shape[1] for group in parts for part in group)
+        reference, floor, train = (
+            _in_turn([part.with_slots(slots) for part in group]) for group in zip(*parts, strict=True)
+        )
+        return cls(reference, floor, train)
+
+
+def _split(
+    folder: str, heldout: str, scene_type: SceneType, count: int, training: int, seed: int
+) -> tuple[SceneBatch, SceneBatch, SceneBatch]:
+    """Reference, floor and training scenes of one folder; no scene is in two of them."""
+    whole = _read(folder, scene_type)
+    if heldout:
+        held, train = _distinct(_read(heldout, scene_type)), whole
+    else:
+        kept = min(2 * count, len(whole) // 2)
+        held, train = _distinct(whole[len(whole) - kept :]), whole[: len(whole) - kept]
+    half = min(count, len(held) // 2)
+    if half < 2:
+        raise InvalidInputError(
+            f"{heldout or folder!r} has {len(held)} distinct held-out scenes; at least 4 are needed, half of them for "
+            "the real-against-real floor: generate more, or name a folder with more as heldout="
+        )
+    train = train[~np.isin(_keys(train), _keys(held))]
+    if not len(train):
+        raise InvalidInputError(
+            f"all scenes of data={folder!r} are held-out scenes too; novelty has nothing to compare"
+        )
+    order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))[:training]
+    batches = (held[:half], held[half : 2 * half], train[order])
+    return tuple(SceneBatch(tensor, scene_type) for tensor in batches)  # type: ignore[return-value]
+
+
+def _in_turn(parts: list[SceneBatch]) -> SceneBatch:
+    """The scenes of all parts, in turn, so that any first scenes are from all parts."""
+    numbers = torch.cat([torch.arange(len(part)) for part in parts])
+    whole = SceneBatch.concatenate(parts)
+    return whole[numbers.argsort(stable=True)]
+
+
+def _read(folder: str, scene_type: SceneType) -> Tensor:
+    """(M, N, D) raw scenes of a dataset, in the categories of ``scene_type``."""
+    from scene_envs.datasets import SceneDataset, to_union
+
+    if not Path(folder).exists():
+        raise InvalidInputError(f"no dataset at {folder!r}; scene-envs generate makes one")
+    dataset = SceneDataset.load(folder)
+    if dataset.scene_type.assets == scene_type.assets:
+        return dataset.tensor
+    if dataset.scene_type.name not in scene_type.name.split("+"):
+        raise InvalidInputError(
+            f"{folder!r} holds scenes of {dataset.scene_type.name!r}, the samples are of {scene_type.name!r}; name a "
+            "dataset of that scene type"
+        )
+    return to_union(dataset.batch(), scene_type).tensor
+
+
+def _distinct(tensor: Tensor) -> Tensor:
+    _, first = np.unique(_keys(tensor), return_index=True)
+    return tensor[torch.from_numpy(np.sort(first))]
+
+
+def _keys(tensor: Tensor) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
+    from scene_envs.datasets.dataset import scene_keys
+
+    return scene_keys(tensor)
+
+
+def _folders(text: str) -> list[str]:
+    return [folder.strip() for folder in text.split(",") if folder.strip()]
+
+
+Figures = dict[str, float]
+
+
+@dataclass(frozen=True)
+class EvaluationInputs:
+    """Inputs of an evaluation.
+
+    Attributes:
+        samples: raw samples of a prior.
+        real: real scenes.
+        follow: function that samples a scene of the prior for each prompt; None for a prior that reads no prompts.
+        pool: physics workers; None computes in this process.
+        seed: seed of the classifiers and prompts.
+        fid_weights: path of the weights of an Inception-v3; empty for none.
+        prompts: number of real scenes whose prompts the samples follow; None for all of them.
+
+    >>> empty = SceneBatch.empty("dimsum_table", 2)
+    >>> compute_measure("layout", EvaluationInputs(empty, RealScenes(empty, empty)))["floor_objects_mean"]
+    1.0
+    """
+
+    samples: SceneBatch
+    real: RealScenes
+    follow: Callable[[list[str]], SceneBatch] | None = None
+    pool: PhysicsPool | None = None
+    seed: int = 0
+    fid_weights: str = ""
+    prompts: int | None = None
+
+
+def compute_measure(name: str, inputs: EvaluationInputs) -> Figures:
+    """The figures of one group, each with its floor: the same figure of real scenes against other real scenes.
+
+    Raises:
+        UnknownNameError: no such group.
+        InvalidInputError: the inputs lack something that the group needs.
+        MissingDependencyError: the group needs a package that is not installed.
+    """
+    if name not in MEASURES:
+        raise unknown_name("measure", name, MEASURE_NAMES)
+    return MEASURES[name](inputs)
+
+
+def _with_floor(measure: Callable[[SceneBatch], Figures], inputs: EvaluationInputs) -> Figures:
+    """Figures of the samples, and the same figures of other real scenes as floor."""
+    real = {FLOOR_PREFIX + name: value for name, value in measure(inputs.real.floor).items()}
+    return {**measure(inputs.samples), **real}
+
+
+def _classifier(inputs: EvaluationInputs) -> Figures:
+    from agents.evaluation.classifier import classifier_accuracy
+
+    def measure(batch: SceneBatch) -> Figures:
+        accuracy = classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
+        return {"classifier_accuracy": accuracy.mean, "classifier_accuracy_std": accuracy.std}
+
+    return _with_floor(measure, inputs)
+
+
+def _renders(inputs: EvaluationInputs) -> Figures:
+    from agents.evaluation.pictures import render_classifier_accuracy
+
+    def measure(batch: SceneBatch) -> Figures:
+        accuracy = render_classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
+        return {"render_accuracy": accuracy.mean, "render_accuracy_std": accuracy.std}
+
+    return _with_floor(measure, inputs)
+
+
+def _fsd(inputs: EvaluationInputs) -> Figures:
+    from agents.evaluation.pictures import frechet_scene_distance
+
+    return _with_floor(
+        lambda batch: {"frechet_scene_distance": frechet_scene_distance(batch, inputs.real.reference)}, inputs
+    )
+
+
+def _fid(inputs: EvaluationInputs) -> Figures:
+    from agents.evaluation.pictures import frechet_inception_distance
+
+    if not inputs.fid_weights:
+        raise InvalidInputError("FID needs fid_weights=, the path of an Inception-v3's weights")
+
+    real, weights = inputs.real.reference, inputs.fid_weights
+    return _with_floor(
+        lambda batch: {"frechet_inception_distance": frechet_inception_distance(batch, real, weights)}, inputs
+    )
+
+
+def _prompts(inputs: EvaluationInputs) -> Figures:
+    if inputs.follow is None:
+        raise InvalidInputError("prompt-following needs a prior that reads prompts, and this one was trained without")
+    scenes = inputs.real.floor[: inputs.prompts]
+    prompts = own_prompts(scenes, inputs.seed)
+    figures = prompt_following(inputs.follow(prompts), prompts)
+    real = {FLOOR_PREFIX + name: value for name, value in prompt_following(scenes, prompts).items()}
+    return {**figures, **real, **prompt_chance(scenes, prompts, inputs.seed)}
+
+
+def _novelty(inputs: EvaluationInputs) -> Figures:
+    training = inputs.real.training
+    if training is None:
+        raise InvalidInputError("novelty needs data=, the dataset that the prior was trained on")
+    held_out = nearest_scenes(inputs.real.reference, training)
+
+    def figures(found: Neighbors) -> Figures:
+        return {
+            "novelty": novelty(found, held_out),
+            "nearest_training_cm": 100 * float(found.distance.median()),
+            "copied_fraction": float(found.copied.double().mean()),
+        }
+
+    return _with_floor(lambda batch: figures(nearest_scenes(batch, training)), inputs)
+
+
+MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
+    "layout": lambda inputs: _with_floor(lambda batch: layout_figures(batch, inputs.real.reference), inputs),
+    "physics": lambda inputs: _with_floor(lambda batch: physics_figures(batch, inputs.pool), inputs),
+    "ready": lambda inputs: _with_floor(lambda batch: ready_figures(batch, inputs.pool), inputs),
+    "fsd": _fsd,
+    "novelty": _novelty,
+    "prompts": _prompts,
+    "classifier": _classifier,
+    "renders": _renders,
+    "fid": _fid,
+}
+"""Groups of measures, in the order in which they are computed: cheap ones first."""
+
+
+_HEADS = ("figure", "samples", "real", "how to read")
+_NOT_SHOWN = frozenset({"category_kl"})
+"""Figures that the table leaves out, because they are shown under another name, in units of 1e-4."""
+
+READING: dict[str, str] = {
+    "num_steps": "denoiser evaluations per sample",
+    "physics_guidance": "strength of physics guidance of all samples",
+    "scenes": "samples measured",
+    "objects_mean": "objects per scene, welded ones included",
+    "objects_min": "in the emptiest scene",
+    "objects_max": "in the fullest scene",
+    "free_objects_mean": "objects per scene that are not welded",
+    "category_kl_e4": "KL(real ‖ samples) of the shares of assets, in 10⁻⁴ nats; lower is better",
+    "count_wasserstein": "distance of the distributions of objects per scene, in objects; lower is better",
+    "spacing_wasserstein_mm": "distance of the distributions of distances between neighbours; lower is better",
+    "tallest_stack_mean": "objects in the tallest stack of a scene",
+    "stack_wasserstein": "distance of the distributions of the tallest stack, in objects; lower is better",
+    "workspace_fraction": "objects in the workspace; higher is better",
+    "out_of_workspace_rate": "free objects outside the workspace; lower is better",
+    "duplicates": "samples that repeat another within 1 cm; lower is better",
+    r"height_error_(\w+)_p95_mm": "95 % quantile of the same",
+    r"height_error_(\w+)_mm": "median distance in height to the support ({}); lower is better",
+    "median_total_penetration_cm": "per scene, summed over pairs of convex parts (the literature's); lower is better",
+    "median_total_pair_penetration_cm": "per scene, the deepest overlap of each pair of objects; lower is better",
+    "collision_rate": "scenes with two objects more than 1 mm in each other; lower is better",
+    "furniture_collision_rate": "rooms in which a table or shelf is more than 1 mm in another; lower is better",
+    "overlapping_pairs": "penetrating pairs of objects per scene; lower is better",
+    "overlap_median_mm": "depth over the penetrating pairs; lower is better",
+    "overlap_p95_mm": "95 % quantile of the same",
+    "deeper_than_1mm_fraction": "free objects more than 1 mm in another; lower is better",
+    "deeper_than_1cm_fraction": "free objects more than 1 cm in another; lower is better",
+    "stable_fraction": "free objects that stay within 1 mm and 0.01 rad in simulation; higher is better",
+    "invalid_fraction": "scenes that the physics could not judge",
+    "feasible_objects": "free objects per scene that are neither deep in others nor move; higher is better",
+    "feasible_fraction": "the same as a share of free objects; higher is better",
+    "ready_invalid_fraction": "scenes that could not be made ready",
+    "ready_objects": "feasible objects per scene after projection and settling; higher is better",
+    "ready_fraction": "the same as a share of free objects; higher is better",
+    "classifier_accuracy": "accuracy of a set transformer, samples against real scenes; 0.5 is chance, lower is better",
+    "classifier_accuracy_std": "its spread over the seeds",
+    "render_accuracy": "accuracy of a CNN on their semantic renders; 0.5 is chance, lower is better",
+    "render_accuracy_std": "its spread over the seeds",
+    "frechet_scene_distance": "FSD, on features of a frozen set encoder (no FID); lower is better",
+    "frechet_inception_distance": "FID of semantic renders; lower is better",
+    "prompt_guidance": "weight of classifier-free guidance of the samples with prompts; 0 for none",
+    "prompt_following": "samples of which every claim of their prompt is true; higher is better",
+    r"prompt_(counts|names|relations)": "the same among prompts on {}",
+    r"prompt_(counts|names|relations)_number": "how many prompts on {} there are",
+    "prompt_score": "mean partial credit; higher is better",
+    r"chance_prompt_\w+": "real scenes with the prompts of others: what ignoring the prompt scores",
+    "novelty": "median distance to the nearest training scene, over that of real scenes; 0 for copies, 1 when new",
+    "nearest_training_cm": "median distance per object to the nearest training scene",
+    "copied_fraction": "samples that repeat a training scene within 1 cm; lower is better",
+}
+"""How to read each figure, by its name or a pattern of it."""
+
+
+def figure_table(figures: Mapping[str, float]) -> str:
+    """The figures as a Markdown table: samples, the real-against-real floor, and how to read each.
+
+    The category KL is shown in units of 1e-4 nats, as the paper prints it.
+
+    >>> print(figure_table({"objects_mean": 18.0, "floor_objects_mean": 18.25}))
+    | figure | samples | real | how to read |
+    |---|---|---|---|
+    | objects_mean | 18 | 18.25 | objects per scene, welded ones included |
+    """
+    lines = ["| " + " | ".join(_HEADS) + " |", "|---" * len(_HEADS) + "|"]
+    for name, value in figures.items():
+        if name.startswith(FLOOR_PREFIX) or name in _NOT_SHOWN:
+            continue
+        cells = (name, _number(value), _number(figures.get(FLOOR_PREFIX + name)), how_to_read(name))
+        if name.startswith(CHANCE_PREFIX):  # a figure of real scenes, shown in their column
+            cells = (name, "", _number(value), how_to_read(name))
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def how_to_read(name: str) -> str:
+    """A line on how to read the figure ``name``; empty for an unknown figure.
+
+    >>> how_to_read("height_error_stack_mm")
+    'median distance in height to the support (stack); lower is better'
+    """
+    for pattern, text in READING.items():
+        found = re.fullmatch(pattern, name)
+        if found:
+            return text.format(*found.groups())
+    return ""
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"

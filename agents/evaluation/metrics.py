@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from agents.evaluation.supports import CONTAINERS, SUPPORTS, Container, Support
+from agents.evaluation.layouts import CONTAINERS, SUPPORTS, Container, Support
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_distance import check_same_assets
@@ -62,7 +62,7 @@ def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) 
     within ``reach`` of it horizontally; where the top of the supporting object is above its frame, they must also be
     above that frame. An object is counted under the kind of the candidate that is nearest to its own z. The error is
     how far the object floats above, or is sunk into, the support that it seems to rest on. Objects that lie in a
-    container, see :data:`~agents.evaluation.supports.CONTAINERS`, are left out.
+    container, see :data:`~agents.evaluation.layouts.CONTAINERS`, are left out.
 
     Args:
         batch: scenes to measure.

@@ -12,14 +12,13 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from agents.evaluation.scene_tokens import WAVE_FEATURES, SceneTokens, scene_tokens
-from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
+from agents.evaluation.set_network import WAVE_FEATURES, SceneTokens, SetNetwork, SetNetworkConfig, scene_tokens
 from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.files import read_tensors, write_tensors
 from scene_envs.scene import SceneBatch
-from scene_envs.tensor_files import read_tensors, write_tensors
 
 SHIPPED = Path(__file__).parent / "weights" / "set_encoder.safetensors"
-"""File of the encoder that :func:`~agents.evaluation.frechet.frechet_scene_distance` uses."""
+"""File of the encoder that :func:`~agents.evaluation.pictures.frechet_scene_distance` uses."""
 
 FEATURES = 64
 """Number of features of a scene."""

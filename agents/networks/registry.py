@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from agents.configuration import check_types
+from agents.configuration.composition import check_types
 from agents.networks.baselines import (
     DiffuScene,
     DiffuSceneConfig,
@@ -32,7 +32,7 @@ from agents.networks.flux import (
 )
 from agents.networks.flux_modules import FourierFeaturesConfig, ModuleConfig, ObservedFlagsConfig
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.plugins import load_plugins
+from scene_envs.registry import load_plugins
 
 NETWORKS = ("flux", "midiffusion", "diffuscene")
 """The Flux-style network, and the two that it is compared with."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from scene_envs.datasets.prompts.language import NUMBERS
+from scene_envs.datasets.prompts.parser import NUMBERS
 from scene_envs.errors import InvalidInputError
 
 _LOGGER = logging.getLogger(__name__)

@@ -2,23 +2,27 @@
 
 from typing import TYPE_CHECKING
 
-from scene_envs.lazy import lazy_names
+from scene_envs.registry import lazy_names
 
 if TYPE_CHECKING:
-    from agents.planning.beam import BeamPlanner
-    from agents.planning.best_of import BestOfPlanner
-    from agents.planning.config import SearchConfig
     from agents.planning.evolution import EvolutionPlanner
     from agents.planning.feynman_kac import FeynmanKacPlanner
     from agents.planning.gradient import GradientPlanner
-    from agents.planning.greedy import GreedyPlanner
-    from agents.planning.journal import Journal
-    from agents.planning.ledger import PlanResult, Searchable, SearchBudget, SearchStoppedError
+    from agents.planning.ledger import (
+        PlannerSettings,
+        PlanResult,
+        Searchable,
+        SearchBudget,
+        SearchStoppedError,
+        list_planners,
+        register_planner,
+    )
     from agents.planning.mcts import MCTSPlanner
-    from agents.planning.registry import PlannerSettings, list_planners, register_planner
+    from agents.planning.output import SearchRecord, TreeNode
     from agents.planning.search_run import SearchOutcome, run_search
-    from agents.planning.session import Session
-    from agents.planning.tree_file import SearchRecord, TreeNode
+    from agents.planning.session import Journal, Session
+    from agents.planning.settings import SearchConfig
+    from agents.planning.simple import BeamPlanner, BestOfPlanner, GreedyPlanner
 
 __all__ = [
     "BeamPlanner",

@@ -10,9 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from agents.planning.greedy import GreedyPlanner
-from agents.planning.ledger import PlanResult, Progress, Searchable, SteeredProblem
-from agents.planning.registry import PlannerSettings, check_at_least, register_planner
+from agents.planning.ledger import (
+    PlannerSettings,
+    PlanResult,
+    Progress,
+    Searchable,
+    SteeredProblem,
+    check_at_least,
+    register_planner,
+)
+from agents.planning.simple import GreedyPlanner
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 

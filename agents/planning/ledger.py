@@ -5,12 +5,13 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
 from scene_envs.errors import InvalidInputError, SceneEnvsError
+from scene_envs.registry import Registry
 
 Progress = Callable[[int, float], None]
 """Called after every round with the expansions so far and the best value so far."""
@@ -221,3 +222,80 @@ def state_value(problem: Searchable, state: Any) -> float:
 
 def _rank(candidate: Candidate) -> tuple[float, int, tuple[int, ...]]:
     return -candidate.value, len(candidate.path), candidate.path
+
+
+ENTRY_POINT_GROUP = "scene_envs.planners"
+"""Entry points of installed packages: modules that call :func:`register_planner` when they are imported."""
+PER_STATE = ("children", "parallel")
+"""Keys of planners in which null means ``branching``, the children of a state that the user asks for."""
+
+
+@dataclass(frozen=True)
+class PlannerSettings:
+    """A planner by name, and its keys.
+
+    Attributes:
+        name: name of a registered planner.
+    """
+
+    name: str = ""
+    widens: ClassVar[bool] = False
+    """Whether the planner itself chooses the number of children of a state; in a search run, a state then has as many
+    actions as the budget."""
+    steers: ClassVar[bool] = False
+    """Whether the planner itself steers the denoising."""
+
+    def make(self, branching: int) -> Any:
+        """The planner: an object with ``plan(problem, budget, progress)``, as :class:`agents.planning.GreedyPlanner`.
+
+        Settings with a method ``plan`` are themselves the planner, with ``branching`` in place of null in the keys of
+        :data:`PER_STATE`.
+
+        Args:
+            branching: number of children of a state, which replaces null.
+        """
+        unset: dict[str, Any] = {name: branching for name in PER_STATE if getattr(self, name, branching) is None}
+        return replace(self, **unset) if unset else self
+
+
+_FILES = {"beam": "simple", "best_of": "simple", "greedy": "simple"}
+"""Files of planners that are not called like their planner."""
+_SHIPPED = ("beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts")
+_PLANNERS: Registry[type[PlannerSettings]] = Registry(
+    "planner", ENTRY_POINT_GROUP, modules={name: f"agents.planning.{_FILES.get(name, name)}" for name in _SHIPPED}
+)
+Settings = TypeVar("Settings", bound=type[PlannerSettings])
+
+
+def register_planner(name: str) -> Callable[[Settings], Settings]:
+    """Make a planner available as ``planner=name``; decorates the dataclass of the planner's keys.
+
+    The method ``make`` of the dataclass makes the planner.
+
+    Raises:
+        InvalidInputError: the name is not one word.
+    """
+    _PLANNERS.check_name(name, "beam")
+    return _PLANNERS.adding(name)
+
+
+def list_planners() -> list[str]:
+    """Names of all planners, those of installed packages included, sorted."""
+    return _PLANNERS.names()
+
+
+def planner_settings(name: str) -> type[PlannerSettings]:
+    """The dataclass of a planner's keys.
+
+    Raises:
+        UnknownNameError: no planner has that name; the nearest known one is offered.
+    """
+    return _PLANNERS[name]
+
+
+def check_at_least(planner: PlannerSettings, minimum: float, *names: str) -> None:
+    """Raise InvalidInputError if a key is below ``minimum`` or not finite; keys that are None are left to ``make``."""
+    for name in names:
+        value = getattr(planner, name)
+        if value is not None and not (minimum <= value < float("inf")):
+            raise InvalidInputError(f"planner {planner.name}: {name} must be a number >= {minimum:g}, got {value}")

@@ -5,8 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from agents.planning.ledger import Candidate, PlanResult, Progress, Searchable, SearchBudget, state_value
-from agents.planning.registry import PlannerSettings, check_at_least, register_planner
+from agents.planning.ledger import (
+    Candidate,
+    PlannerSettings,
+    PlanResult,
+    Progress,
+    Searchable,
+    SearchBudget,
+    check_at_least,
+    register_planner,
+    state_value,
+)
 from scene_envs.errors import unknown_name
 
 ROLLOUTS = ("random", "all")

@@ -12,21 +12,24 @@ from typing import Any
 
 import torch
 
-from agents.configuration import config_text, plain_tree
-from agents.planning.best_of import BestOfPlanner
-from agents.planning.config import SearchConfig
-from agents.planning.journal import Journal
+from agents.configuration.composition import config_text, plain_tree
 from agents.planning.ledger import PlanResult
-from agents.planning.search_metrics import loss_of, search_metrics
-from agents.planning.search_report import draw_curve, draw_scene
-from agents.planning.session import Session
-from agents.planning.tree_file import SearchRecord
-from agents.planning.tree_page import shown_nodes, write_tree_page
+from agents.planning.output import (
+    SearchRecord,
+    draw_curve,
+    draw_scene,
+    loss_of,
+    search_metrics,
+    shown_nodes,
+    write_tree_page,
+)
+from agents.planning.session import Journal, Session
+from agents.planning.settings import SearchConfig
+from agents.planning.simple import BestOfPlanner
 from scene_envs.envs import SearchEnv, SearchMaskEnv, SearchState
-from scene_envs.envs.resolvers import resolve_prior
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
-from scene_envs.files import sealed, write_json, write_text
-from scene_envs.folders import claimed
+from scene_envs.files import claimed, sealed, write_json, write_text
 from scene_envs.scene import SceneBatch
 
 _PLAIN = (bool, int, float, str, list, dict, type(None))

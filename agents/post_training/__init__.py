@@ -2,25 +2,25 @@
 
 from typing import TYPE_CHECKING
 
-from scene_envs.lazy import lazy_names
+from scene_envs.registry import lazy_names
 
 if TYPE_CHECKING:
-    from agents.post_training.advantages import Advantage, compute_advantages
-    from agents.post_training.algorithm_settings import AlgorithmSettings, DDPOSFSettings
-    from agents.post_training.algorithms import list_algorithms, register_algorithm
-    from agents.post_training.base import Algorithm
-    from agents.post_training.comparison_run import post_train_and_compare
-    from agents.post_training.config import PostTrainConfig
-    from agents.post_training.ddpo import DDPO
+    from agents.post_training.algorithms.base import Advantage, Algorithm, compute_advantages
+    from agents.post_training.algorithms.ddpo import DDPO, DDPOSFLoss
+    from agents.post_training.algorithms.forward_process import AWMLoss, ForwardProcess, ForwardProcessLoss, NFTLoss
+    from agents.post_training.algorithms.guidance_distillation import GuidanceDistillation, GuidanceDistillationLoss
     from agents.post_training.discriminator import Discriminator
-    from agents.post_training.forward_losses import AWMLoss, NFTLoss
-    from agents.post_training.forward_process import ForwardProcess
-    from agents.post_training.forward_process_loss import ForwardProcessLoss
     from agents.post_training.guard import Guard
-    from agents.post_training.guidance_distillation import GuidanceDistillation, GuidanceDistillationLoss
-    from agents.post_training.losses import DDPOSFLoss
     from agents.post_training.policy import DenoisingPolicy, gradient_weights
+    from agents.post_training.report import post_train_and_compare
     from agents.post_training.rollouts import SeededPolicy, collect
+    from agents.post_training.settings import (
+        AlgorithmSettings,
+        DDPOSFSettings,
+        PostTrainConfig,
+        list_algorithms,
+        register_algorithm,
+    )
     from agents.post_training.trainer import PostTrainer, PostTrainResult, post_train
 
 __all__ = [

@@ -13,9 +13,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from agents.post_training.comparison import Measured, draw_side_by_side, measure_prior, number_rows
-from agents.post_training.comparison_run import PHYSICS_TIMEOUT, SAMPLE_SEED
-from agents.post_training.report import Page, Picture, Section, Tile, write_report
+from agents.post_training.report import (
+    PHYSICS_TIMEOUT,
+    SAMPLE_SEED,
+    Measured,
+    Page,
+    Picture,
+    Section,
+    Tile,
+    draw_side_by_side,
+    measure_prior,
+    number_rows,
+    write_report,
+)
 from agents.post_training.run_files import METRICS_NAME, write_metrics
 from agents.priors.prior import ScenePrior
 from rewards import reward_label

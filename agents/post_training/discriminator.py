@@ -12,9 +12,7 @@ from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
 from agents.evaluation.classifier import RESOLUTION
-from agents.evaluation.scene_tokens import SceneTokens, blurred, scene_tokens
-from agents.evaluation.set_network import ObjectNetwork
-from agents.evaluation.typical_places import TypicalPlaces
+from agents.evaluation.set_network import ObjectNetwork, SceneTokens, TypicalPlaces, blurred, scene_tokens
 from agents.utils.seeds import derived_generator, derived_seed
 from rewards import RewardContext, RewardOutput, register_reward
 from scene_envs.errors import InvalidInputError

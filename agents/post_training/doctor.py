@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from tensordict import TensorDictBase
 
-from agents.configuration import changed
-from agents.post_training.advantages import final_reward
-from agents.post_training.algorithm_settings import GuidanceDistillationSettings
-from agents.post_training.config import PostTrainConfig
-from agents.post_training.gradients import accumulate_policy_gradient, gradient_norm
+from agents.configuration.composition import changed
+from agents.post_training.algorithms.base import final_reward, gradient_norm
+from agents.post_training.algorithms.ddpo import DDPOSFLoss, accumulate_policy_gradient
 from agents.post_training.learner import Learner
-from agents.post_training.losses import DDPOSFLoss
+from agents.post_training.settings import GuidanceDistillationSettings, PostTrainConfig
 from agents.post_training.trainer import PostTrainer
 from agents.priors.prior import ScenePrior
 

@@ -3,37 +3,160 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, nn
 
-from agents.configuration import MAX_GRADIENT_NORM
-from agents.post_training.algorithms import make_algorithm
-from agents.post_training.base import Algorithm
-from agents.post_training.config import PostTrainConfig
-from agents.post_training.gradients import gradient_norm
-from agents.post_training.learned_rewards import FIRST_SAMPLES, LearnedRewards
+from agents.configuration.composition import MAX_GRADIENT_NORM
+from agents.post_training.algorithms.base import Algorithm, gradient_norm
 from agents.post_training.policy import DenoisingPolicy
-from agents.post_training.processes import WholeBatchReward
-from agents.post_training.prompts import PromptDeck
+from agents.post_training.real_scenes import SceneBank
 from agents.post_training.regularisation import Regularisation
-from agents.post_training.rollouts import collect, stream_seed
+from agents.post_training.rollouts import PromptDeck, collect, gathered_scenes, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME
-from agents.post_training.scene_bank import SceneBank
+from agents.post_training.settings import PostTrainConfig, make_algorithm
 from agents.priors.prior import ScenePrior, no_text
 from agents.utils.checkpoints import check_tensors
-from agents.utils.process_group import ProcessGroup
+from agents.utils.process_group import ProcessGroup, gather_rows
 from agents.utils.weight_average import AveragedWeights
-from rewards import depends_on_batch
+from rewards import (
+    RewardContext,
+    RewardOutput,
+    averages_objects,
+    counts_objects,
+    depends_on_batch,
+    learned_parts,
+    reward_name,
+)
+from rewards.evaluation import evaluate_reward
 from rewards.process import close_reward, run_reward
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.scoring import RewardScorer
-from scene_envs.errors import RewardError
+from scene_envs.errors import InvalidInputError, RewardError
 from scene_envs.scene import SceneBatch
+
+FIRST_SAMPLES = 128
+"""Number of samples of the base prior from which a reward learns before the first iteration."""
+FIRST_STEPS = 150
+"""Number of optimiser steps on these samples."""
+
+
+class LearnedRewards:
+    """The parts of a run's reward that learn (:class:`rewards.LearnedReward`).
+
+    All processes have the same models.
+
+    Args:
+        reward: resolved reward of the run.
+        config: configuration of the run.
+    """
+
+    def __init__(self, reward: Any, config: PostTrainConfig) -> None:
+        self.parts = learned_parts(reward)
+        self._config = config
+        self._seed = stream_seed(config.seed, "discriminator")
+
+    def __bool__(self) -> bool:
+        return bool(self.parts)
+
+    def begin(self, real: SceneBatch) -> None:
+        """Give the parts the real scenes that training may see."""
+        for part in self.parts:
+            part.begin(real, self._seed)
+
+    def learn_from_prior(self, prior: ScenePrior, slots: int, prompts: Sequence[str] | None) -> None:
+        """Train the parts on samples of the base prior, before they score the first batch.
+
+        Args:
+            prior: base prior.
+            slots: slots per sample.
+            prompts: one prompt for each of the ``FIRST_SAMPLES``; None without prompts.
+        """
+        samples = ProcessGroup.current().from_first(
+            lambda: prior.sample(
+                FIRST_SAMPLES,
+                prompt=prompts,
+                guidance=self._config.guidance if prompts else 0.0,
+                claim_guidance=self._config.claim_guidance if prompts else 0.0,
+                physics_guidance=0.0,
+                num_steps=self._config.num_steps,
+                slots=slots,
+                seed=self._seed,
+                batch_size=self._config.batch_size,
+            ).tensor.cpu()
+        )
+        batch = SceneBatch(samples, prior.scene_type)
+        for part in self.parts:
+            part.learn(batch, FIRST_STEPS)
+
+    def learn(self, batch: TensorDictBase) -> None:
+        """Train the parts on the scenes of a batch, after these were scored."""
+        if self.parts:
+            scenes = gathered_scenes(batch)
+            for part in self.parts:
+                part.learn(scenes)
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"learned_rewards": [part.state_dict() for part in self.parts]}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Inverse of :meth:`state`, after :meth:`begin`."""
+        for part, own in zip(self.parts, state["learned_rewards"], strict=True):
+            part.load_state_dict(own)
+
+
+def check_shares(config: PostTrainConfig, processes: int) -> None:
+    """Refuse a batch that cannot be split among ``processes``.
+
+    Raises:
+        InvalidInputError: the processes do not divide the batch.
+    """
+    if config.batch_size % processes:
+        lower = config.batch_size // processes * processes
+        nearest = f"{lower} or {lower + processes}" if lower else str(processes)
+        raise InvalidInputError(
+            f"batch_size={config.batch_size} is not a multiple of {processes}, the number of processes; give "
+            f"batch_size={nearest}, or another number of processes"
+        )
+
+
+class WholeBatchReward:
+    """A reward that depends on the other scenes of a batch, for which each process scores the scenes of all processes.
+
+    Args:
+        reward: resolved reward.
+        processes: processes that call this reward together, each with the same number of scenes.
+    """
+
+    depends_on_batch = True
+
+    def __init__(self, reward: Any, processes: ProcessGroup) -> None:
+        self._reward, self._processes = reward, processes
+        self.name = reward_name(reward)
+        self.averages_objects, self.counts_objects = averages_objects(reward), counts_objects(reward)
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Scores of ``batch``."""
+        everything = SceneBatch(gather_rows(batch.tensor), batch.scene_type)
+        prompts = context.prompts
+        if prompts is not None:
+            prompts = tuple(text for texts in self._processes.gather(tuple(prompts)) for text in texts)
+        output = evaluate_reward(self._reward, everything, replace(context, prompts=prompts))
+        rows = self._processes.rows(len(everything))
+        return replace(
+            output,
+            value=output.value[rows],
+            valid=None if output.valid is None else output.valid[rows],
+            per_object=None if output.per_object is None else output.per_object[rows],
+            terms={name: term[rows] for name, term in output.terms.items()},
+            object_flags={name: flags[rows] for name, flags in output.object_flags.items()},
+        )
 
 
 class NonFiniteGradient(Exception):

@@ -11,35 +11,173 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
+from torch import Generator
 
-from agents.post_training.base_samples import kept_base_samples
-from agents.post_training.config import PostTrainConfig
-from agents.post_training.curves import draw_curve
-from agents.post_training.early_refusals import check_it_can_learn, nothing_scored
-from agents.post_training.guard import Guard, realism
-from agents.post_training.guard_files import GuardFiles, make_guard
-from agents.post_training.learner import Learner, NonFiniteGradient
-from agents.post_training.processes import check_shares
-from agents.post_training.progress import run_progress
-from agents.post_training.prompts import PromptSets, prompts_beside
-from agents.post_training.rollouts import gathered_scenes, reward_figures, stream_seed
+from agents.configuration.prior_names import short_name
+from agents.post_training.algorithms.base import no_credit_per_object
+from agents.post_training.guard import Guard, GuardReading, SampleCheck, realism
+from agents.post_training.learner import Learner, NonFiniteGradient, check_shares
+from agents.post_training.real_scenes import SceneBank, kept_base_samples, kept_scenes
+from agents.post_training.rollouts import PromptSets, gathered_scenes, prompts_beside, reward_figures, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
+    draw_curve,
     load_resumable,
     run_metrics,
+    run_progress,
     write_config,
     write_log,
     write_metrics,
+    writing,
 )
-from agents.post_training.scene_bank import SceneBank, kept_scenes
+from agents.post_training.settings import PostTrainConfig
 from agents.priors.prior import ScenePrior, check_object_count
 from agents.utils.checkpoints import save_checkpoint
 from agents.utils.interrupts import finishing_steps
 from agents.utils.loggers import make_logger
 from agents.utils.process_group import ProcessGroup, launched_processes
 from rewards import reward_label
-from scene_envs.errors import TrainingError
-from scene_envs.folders import claimed
+from scene_envs.errors import InvalidInputError, TrainingError
+from scene_envs.files import claimed
+from scene_envs.scene import SceneBatch
+
+_PROBED = 2
+"""Real scenes on which the reward of a run is tried."""
+_PROBED_WITH_PROMPTS = 8
+"""The same number in a run that uses the prompts of its real scenes."""
+
+
+def check_it_can_learn(learner: Learner, real: SceneBatch, prompts: PromptSets | None) -> None:
+    """Score real scenes as the scenes of the run will be scored.
+
+    Real scenes are scored with their own prompts if the run uses the prompts of real scenes, and with the prompts of
+    the run otherwise. With prompts that are not their own, it may be that no real scene can be scored. A run with such
+    prompts is therefore not refused if no real scene is scored.
+
+    Args:
+        learner: learner of the run, which can already deal prompts.
+        real: real scenes.
+        prompts: prompts of each real scene; None for a prior that reads no prompts.
+
+    Raises:
+        InvalidInputError: credit per object is asked of a reward that gives none, or the guard has a limit of
+            stacks for assets without geometry.
+        TrainingError: the reward scores none of the real scenes.
+    """
+    config, scene_type = learner.config, learner.prior.scene_type
+    if config.guard.limits.stack is not None and not scene_type.has_geometry:
+        raise InvalidInputError(
+            f"guard.limits.stack={config.guard.limits.stack} needs the geometry of the assets, and those of "
+            f"{scene_type.name!r} have none here; leave it out"
+        )
+    scenes, texts = _tried(learner, real, prompts)
+    score = learner.scorer(scenes, texts)
+    valid = bool(score.valid.any())
+    if valid and score.per_object is None and getattr(config.algorithm, "credit", "") == "object":
+        raise no_credit_per_object()
+    if config.prompt in (None, "data") and not learner.processes.any(valid):
+        pairs = "" if texts is None else " with a prompt"
+        raise nothing_scored(config, f"none of {len(scenes)} real scenes{pairs}, so that nothing was sampled")
+
+
+def nothing_scored(config: PostTrainConfig, what: str) -> TrainingError:
+    """The error for a run whose reward scored ``what``."""
+    return TrainingError(
+        f"the reward {config.plain()['reward']!r} scored {what}; the warnings above say why, and "
+        "`scene-envs check-reward` tries a reward on its own"
+    )
+
+
+def _tried(learner: Learner, real: SceneBatch, prompts: PromptSets | None) -> tuple[SceneBatch, list[str] | None]:
+    """The first real scenes and a prompt for each, None in a run without prompts.
+
+    If the run uses the prompts of real scenes, more scenes are tried, each with all of its prompts, because a reward
+    may read only one kind of prompt.
+    """
+    if learner.config.prompt == "data" and prompts is not None:
+        pairs = [(row, text) for row in range(min(_PROBED_WITH_PROMPTS, len(real))) for text in prompts(row)]
+        return real[torch.tensor([row for row, _ in pairs])], [text for _, text in pairs]
+    scenes = real[:_PROBED]
+    if learner.deck is None:
+        return scenes, None
+    return scenes, learner.deck.deal(len(scenes), Generator().manual_seed(learner.config.seed))
+
+
+_PICTURED = 6
+"""Number of the guard's samples that are kept for the report."""
+
+
+def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> Guard:
+    """The guard of a run; it samples if the configuration says so."""
+    asked, count, check = scenes.heldout_prompts(), config.guard.sampled, None
+    if count:
+        check = SampleCheck(
+            learner.prior.decode(scenes.heldout[:count]).to("cpu"),
+            learner.scorer,
+            count,
+            config.num_steps,
+            stream_seed(config.seed, "samples"),
+            learner.slots,
+            None if config.prompt is None else scenes.heldout_prompts(count, learner.slots, learner.prior.scene_type),
+            config.guidance,
+            config.claim_guidance,
+        )
+    limits = config.guard.sample_limits(config.algorithm.sample_limits)
+    held = config.regularisation.target
+    target = math.inf if held is None else held
+    seed, learns = stream_seed(config.seed, "guard"), bool(learner.learned)
+    return Guard(scenes.heldout, config.guard.limit, seed, asked, check, limits, target, learns)
+
+
+class GuardFiles:
+    """Files of the guard in a run's folder; only the first process writes.
+
+    Args:
+        config: configuration of the run.
+        base: name of the base prior; empty for a prior that was not loaded by name.
+    """
+
+    def __init__(self, config: PostTrainConfig, base: str) -> None:
+        self.directory = config.directory
+        self._facts: dict[str, Any] = {
+            "algorithm": config.algorithm.name,
+            **({"base": short_name(base)} if base else {}),
+            "reward": config.plain()["reward"],
+        }
+        self._processes = ProcessGroup.current()
+
+    def keep(self, prior: ScenePrior, guard: Guard, iteration: int) -> None:
+        """Write the evaluated weights to ``prior/``, with a card that says how they were made."""
+        # figures of the base prior are not those of other weights
+        unknown = ("measures", "limits") if iteration else ()
+        prior.card = {
+            **{key: value for key, value in prior.card.items() if key not in unknown},
+            "post_training": {
+                **self._facts,
+                "iteration": iteration,
+                "mean_reward": guard.best_reward if iteration else None,
+                "guard_ratio": guard.ratio,
+            },
+        }
+        path = self.directory / "prior"
+        if self._processes.is_first:
+            writing(f"the prior {str(path)!r}", lambda: prior.save(path))
+
+    def best(self) -> ScenePrior:
+        """The prior that was kept last."""
+        self._processes.wait()  # until it is written
+        return ScenePrior.load(self.directory / "prior")
+
+    def picture(self, guard: Guard, reading: GuardReading) -> None:
+        """Keep the samples of the best checkpoint, and of the first check beyond a limit, for the report."""
+        batch = guard.last_samples
+        name = "guard_within" if reading.kept else "guard_beyond"
+        first = reading.beyond and guard.over_limit_at == reading.iteration
+        if batch is None or not reading.samples or not (reading.kept or first) or not self._processes.is_first:
+            return
+        path = self.directory / f"{name}.safetensors"
+        writing(f"the guard's samples {str(path)!r}", lambda: batch[:_PICTURED].save(path))
+
 
 MAX_INVALID = 3
 """Consecutive batches without a valid reward after which a run stops."""

@@ -2,10 +2,10 @@
 
 from typing import TYPE_CHECKING
 
-from scene_envs.lazy import lazy_names
+from scene_envs.registry import lazy_names
 
 if TYPE_CHECKING:
-    from agents.pretraining.config import PretrainConfig
+    from agents.pretraining.settings import PretrainConfig
     from agents.pretraining.trainer import Pretrainer, pretrain
 
 __all__ = ["PretrainConfig", "Pretrainer", "pretrain"]

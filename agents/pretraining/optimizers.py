@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adamw import adamw
 
-from agents.pretraining.config import PretrainConfig
+from agents.pretraining.settings import PretrainConfig
 from scene_envs.errors import unknown_name
 
 OPTIMIZERS = ("adamw", "muon")

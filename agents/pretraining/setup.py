@@ -9,15 +9,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from agents.pretraining.config import PretrainConfig
-from agents.pretraining.data import PROMPTS_PER_SCENE, GrammarStream, SceneTable, TrainingData, UnionTable
-from agents.pretraining.initial_prior import FITTED_ON, build_prior
+from agents.pretraining.initial_prior import (
+    FITTED_ON,
+    PROMPTS_PER_SCENE,
+    GrammarStream,
+    SceneTable,
+    TrainingData,
+    UnionTable,
+    build_prior,
+)
+from agents.pretraining.settings import PretrainConfig
 from agents.priors.files import PriorFacts
 from agents.priors.prior import ScenePrior
 from scene_envs.datasets import SceneDataset, to_union
+from scene_envs.datasets.dataset import union_normalizer
+from scene_envs.datasets.generate import fixed_normalizer
 from scene_envs.datasets.prompts import describe_all
-from scene_envs.datasets.ranges import fixed_normalizer
-from scene_envs.datasets.union import union_normalizer
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch

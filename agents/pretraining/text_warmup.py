@@ -10,7 +10,7 @@ import torch
 from torch import nn
 from torch.optim.lr_scheduler import LambdaLR
 
-from agents.pretraining.data import TrainingData
+from agents.pretraining.initial_prior import TrainingData
 from agents.priors.prior import ScenePrior
 from agents.utils.seeds import derived_generator
 from scene_envs.scene import POSE_FEATURES

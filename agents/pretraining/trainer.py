@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import logging
 import math
 import time
@@ -15,27 +17,91 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
-from agents.configuration import MAX_GRADIENT_NORM, config_text, dotted
-from agents.pretraining.config import PretrainConfig
-from agents.pretraining.data import TrainingData
-from agents.pretraining.log import TrainingLog, draw_samples
+from agents.configuration.composition import MAX_GRADIENT_NORM, config_text, dotted
+from agents.configuration.prior_names import short_name
+from agents.pretraining.initial_prior import TrainingData
 from agents.pretraining.optimizers import build_optimizer, learning_rate_at
-from agents.pretraining.settings import WEIGHT_DECAY
+from agents.pretraining.settings import WEIGHT_DECAY, PretrainConfig
 from agents.pretraining.setup import prepare
 from agents.pretraining.text_warmup import warm_up_text
-from agents.prior_names import short_name
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
 from agents.utils.interrupts import Ending, finishing_steps
-from agents.utils.loggers import make_logger
+from agents.utils.loggers import RunLogger, make_logger
 from agents.utils.process_group import ProcessGroup, is_first_process
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
-from scene_envs.errors import InvalidInputError, TrainingError
-from scene_envs.files import sealed, write_json, write_text
-from scene_envs.folders import claimed
+from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError
+from scene_envs.files import claimed, sealed, write_json, write_text
 
 logger = logging.getLogger(__name__)
+
+FIELDS = ("step", "loss", "heldout", "gradient_norm", "learning_rate", "seconds")
+
+
+class TrainingLog:
+    """Log of a run; each row is written at once.
+
+    Args:
+        directory: folder of ``log.csv``.
+        also: another logger that gets the same rows, see :func:`agents.utils.loggers.make_logger`.
+    """
+
+    def __init__(self, directory: Path, also: RunLogger | None = None) -> None:
+        self.directory = directory
+        self._also = RunLogger() if also is None else also
+
+    def begin(self, step: int) -> None:
+        """Keep each row up to ``step`` once; remove rows beyond a checkpoint and, with ``step`` 0, of another run."""
+        path = self.directory / "log.csv"
+        if not path.exists():
+            return
+        with path.open(newline="", encoding="utf-8", errors="replace") as file:
+            rows = list(csv.DictReader(file))
+        # the last row of a killed run may lack some numbers
+        whole = [row for row in rows if str(row.get("step") or "").isdigit() and None not in map(row.get, FIELDS)]
+        kept = {int(row["step"]): row for row in whole if int(row["step"]) <= step}
+        if not kept:
+            path.unlink()
+            return
+        text = io.StringIO()
+        writer = csv.DictWriter(text, FIELDS, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(kept[number] for number in sorted(kept))
+        write_text(path, text.getvalue())
+
+    def close(self) -> None:
+        """Close the other logger."""
+        self._also.close()
+
+    def write(self, row: dict[str, float], last_step: int) -> None:
+        """Write one row; the time left is estimated from ``last_step``."""
+        step, seconds = int(row["step"]), row["seconds"]
+        left = (last_step - step) * seconds / max(1, step)
+        logger.info("%s  left %.0f s", "  ".join(f"{key} {value:.6g}" for key, value in row.items()), left)
+        path = self.directory / "log.csv"
+        fresh = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, FIELDS)
+            if fresh:
+                writer.writeheader()
+            writer.writerow(row)
+        self._also.log({key: value for key, value in row.items() if key != "step"}, step)
+
+
+def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> None:
+    """Draw a gallery of samples of a prior, ``samples-STEP.png`` in ``directory``; skipped without PyBullet."""
+    from scene_envs.render import gallery, render
+
+    batch = prior.sample(8, num_steps=50, seed=seed).to("cpu")
+    captions = [f"{int(count)} objects" for count in batch.counts]
+    try:
+        images = render(batch, width=400, height=300)
+    except MissingDependencyError as error:
+        logger.warning("no pictures of samples: %s", error)
+        return
+    gallery(list(images), columns=4, captions=captions).save(directory / f"samples-{step:07d}.png")
+
 
 _MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe")
 """Keys that may change between a run and its continuation."""

@@ -1,6 +1,6 @@
 """Scene priors: trained denoisers that sample, complete and rearrange scenes."""
 
-from agents.prior_names import list_priors
+from agents.configuration.prior_names import list_priors
 from agents.priors.checkpoint_import import import_checkpoint
 from agents.priors.config import DenoiserConfig, MixedPriorConfig, PoseDiffusionConfig, PriorConfig
 from agents.priors.continuous import ContinuousPrior

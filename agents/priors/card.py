@@ -12,11 +12,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.prior_names import CONFIG_NAME
+from agents.configuration.prior_names import CONFIG_NAME
 from agents.priors.files import PriorFacts, read_config, write_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
-from scene_envs.files import read_sealed, write_text
-from scene_envs.folders import claimed
+from scene_envs.files import claimed, read_sealed, write_text
 
 if TYPE_CHECKING:
     from agents.priors.prior import ScenePrior

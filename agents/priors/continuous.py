@@ -13,11 +13,15 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from agents.configuration import check_types
+from agents.configuration.composition import check_types
 from agents.diffusion import GaussianProcess, GaussianStep, Preconditioning, ResidualVariance, ReverseStep, StepTable
-from agents.diffusion.gaussian import timestep_weights
-from agents.diffusion.schedules import make_schedule
-from agents.diffusion.weighting import check_weighting, loss_weights, timestep_distribution
+from agents.diffusion.gaussian import (
+    check_weighting,
+    loss_weights,
+    make_schedule,
+    timestep_distribution,
+    timestep_weights,
+)
 from agents.networks.denoisers import Denoiser
 from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import Text

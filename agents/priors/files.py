@@ -16,13 +16,12 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from agents.configuration.prior_names import CONFIG_NAME, find_prior
 from agents.diffusion import Preconditioning, ResidualVariance
-from agents.prior_names import CONFIG_NAME, find_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError, unknown_name
-from scene_envs.files import with_digest, without_digest, write_json
+from scene_envs.files import read_tensors, with_digest, without_digest, write_json, write_tensors
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
-from scene_envs.tensor_files import read_tensors, write_tensors
 
 WEIGHTS_NAME = "model.safetensors"
 RESIDUAL = "residual."

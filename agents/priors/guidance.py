@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from agents.diffusion.gaussian import StepTable
 from agents.diffusion.reverse_steps import MixedStep, ReverseStep, state_of
-from agents.diffusion.step_tables import StepTable
 from agents.priors.claim_guidance import ClaimGuidance, claims_of
 from scene_envs.datasets.prompts.claims import (
     Claim,
@@ -190,7 +190,7 @@ class NumberGuidance:
     outside the bounds that the claims put on it, the probabilities of the kind are multiplied by one factor for all
     slots, so that it comes to the nearest bound. Of all distributions with these expectations this one has the least
     divergence from that of the prior (Csiszar 1975). The chance of a slot to be unmasked stays as it is. Kinds with a
-    factor, or with one number as bounds, are drawn by systematic sampling (:mod:`agents.diffusion.unmasking`).
+    factor, or with one number as bounds, are drawn by systematic sampling (:mod:`agents.diffusion.categorical`).
 
     Steps of continuous priors, and of categories that are replaced or unmasked independently, are not changed.
 

@@ -15,7 +15,7 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from agents.configuration import check_types
+from agents.configuration.composition import check_types
 from agents.diffusion import (
     CategoricalProcess,
     GaussianProcess,
@@ -24,12 +24,9 @@ from agents.diffusion import (
     ResidualVariance,
     StepTable,
 )
-from agents.diffusion.categorical import make_categorical_schedule
-from agents.diffusion.gaussian import timestep_weights
+from agents.diffusion.categorical import UNMASKINGS, make_categorical_schedule
+from agents.diffusion.gaussian import check_weighting, loss_weights, make_schedule, timestep_weights
 from agents.diffusion.reverse_steps import ReverseStep, state_of
-from agents.diffusion.schedules import make_schedule
-from agents.diffusion.unmasking import UNMASKINGS
-from agents.diffusion.weighting import check_weighting, loss_weights
 from agents.networks.denoisers import MixedDenoiser, Observed
 from agents.networks.flux_modules import CountConditioning
 from agents.networks.registry import build_network, config_from_state
@@ -47,7 +44,7 @@ from agents.priors.prior import (
     no_text,
 )
 from scene_envs.datasets.prompts.facts import SIDES
-from scene_envs.datasets.prompts.language import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns
+from scene_envs.datasets.prompts.parser import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike

@@ -13,12 +13,12 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Generator, Tensor, nn
 
+from agents.configuration.prior_names import joint_name, split_name
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, ReverseStep, StepTable
 from agents.networks.denoisers import Observed
 from agents.networks.flux_modules import CountConditioning
 from agents.networks.registry import config_state
 from agents.networks.text import Text
-from agents.prior_names import joint_name, split_name
 from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.files import StoredPrior, explained, read_stored, write_stored
 from agents.priors.guidance import Guide, Hook, Start, Watch, guidance_hook, physics_strength

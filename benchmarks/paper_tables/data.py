@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from agents.pretraining.config import PretrainConfig
+from agents.pretraining.settings import PretrainConfig
 from benchmarks.paper_tables.settings import TablesConfig
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from agents.pretraining.data import TrainingData
+    from agents.pretraining.initial_prior import TrainingData
     from agents.priors.prior import ScenePrior
     from scene_envs.datasets import SceneDataset
     from scene_envs.scene import SceneBatch

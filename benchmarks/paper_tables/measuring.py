@@ -99,7 +99,7 @@ def _classifier(samples: SceneBatch, reference: SceneBatch, settings: TablesConf
 
 
 def _frechet(samples: SceneBatch, reference: SceneBatch) -> dict[str, float]:
-    from agents.evaluation.frechet import frechet_scene_distance
+    from agents.evaluation.pictures import frechet_scene_distance
 
     return {"frechet_scene_distance": frechet_scene_distance(samples, reference)}
 

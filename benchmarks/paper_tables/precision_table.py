@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from agents.configuration import dotted_values
-from agents.pretraining.config import PretrainConfig
+from agents.configuration.composition import dotted_values
+from agents.pretraining.settings import PretrainConfig
 from benchmarks.paper_tables.rows import COSTS, PAPER, Entry, Row, Table, plain_row
 
 _COLUMNS = (

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from agents.configuration import dotted_values
-from agents.pretraining.config import PretrainConfig
+from agents.configuration.composition import dotted_values
+from agents.pretraining.settings import PretrainConfig
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from agents.configuration import dotted, dotted_values
-from agents.pretraining.config import PretrainConfig
+from agents.configuration.composition import dotted, dotted_values
+from agents.pretraining.settings import PretrainConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from agents.configuration import changed, dotted_keys, dotted_values
-from agents.pretraining.config import PretrainConfig
+from agents.configuration.composition import changed, dotted_keys, dotted_values
+from agents.pretraining.settings import PretrainConfig
 from benchmarks.paper_tables.data import RowData, trained_numbers
 from benchmarks.paper_tables.rows import Row
 from benchmarks.paper_tables.settings import TablesConfig

@@ -19,9 +19,9 @@ from unittest.mock import patch
 
 import yaml
 
-from agents.configuration import changed
+from agents.configuration.composition import changed
 from agents.post_training import PostTrainConfig, PostTrainer, regularisation
-from agents.post_training.algorithms import list_algorithms
+from agents.post_training.settings import list_algorithms
 from agents.priors.prior import ScenePrior
 from scene_envs.envs.scoring import RewardScorer
 

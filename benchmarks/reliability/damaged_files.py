@@ -69,7 +69,7 @@ def fuzzed_files(count: int, seed: int = 0) -> Figures:
 def _kinds(folder: Path) -> list[_Kind]:
     import torch
 
-    from agents.planning.tree_file import SearchRecord
+    from agents.planning.output import SearchRecord
     from agents.priors.prior import ScenePrior
     from agents.utils.checkpoints import load_checkpoint, save_checkpoint
     from scene_envs import SceneBatch

@@ -1,11 +1,17 @@
 """The asset library: procedural models with visual mesh, convex parts and mass, and users' own files."""
 
-from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart
+from scene_envs.assets.base import (
+    ASSET_GROUPS,
+    Asset,
+    AssetLibrary,
+    ConvexPart,
+    Model,
+    asset_recipe,
+    register_asset_group,
+)
 from scene_envs.assets.built_in import list_assets
-from scene_envs.assets.groups import ASSET_GROUPS, register_asset_group
 from scene_envs.assets.importing import AssetReport, ImportReport, import_report, load_library
 from scene_envs.assets.library import get_library
-from scene_envs.assets.recipe import Model, asset_recipe
 
 __all__ = [
     "ASSET_GROUPS",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -143,3 +143,123 @@ class AssetLibrary:
     def names(self) -> Sequence[str]:
         """Asset names in category order."""
         return tuple(asset.name for asset in self.assets)
+
+
+_FRUIT = (
+    "apple_gala", "apple_golden", "apple_green", "apple_red", "avocado_a", "avocado_b", "avocado_c", "pear_anjou",
+    "pear_bosc", "pear_red",
+)  # fmt: skip
+
+ASSET_GROUPS: dict[str, frozenset[str]] = {
+    "fruit": frozenset(_FRUIT),
+    "edible": frozenset((*_FRUIT, "bread_slice", "cereal_box")),
+    "drinks": frozenset(("soda_can", "tea_bottle", "water_jug")),
+    "dishes": frozenset(("bowl", "dinner_plate", "fruit_bowl", "plate", "serving_dish", "shared_plate")),
+    "cups": frozenset(("mug", "teacup")),
+    "cutlery": frozenset(("dinner_spoon", "fork", "knife", "teaspoon")),
+    "steamers": frozenset(("steamer_bottom", "steamer_lid")),
+    "games": frozenset(("board_game_l", "board_game_l2", "board_game_s", "board_game_xl", "game_case")),
+    "toys": frozenset(("stacking_ring", "toy_train")),
+    "furniture": frozenset(("breakfast_table", "cafe_table", "chair", "floor", "shelf")),
+}
+"""Names of assets by group."""
+
+
+def register_asset_group(name: str, assets: Iterable[str]) -> None:
+    """Make ``name`` stand for several assets wherever assets are named; a group of that name is replaced.
+
+    Raises:
+        InvalidInputError: ``assets`` is one string.
+
+    >>> register_asset_group("doctest_round", ["dinner_plate", "steamer_bottom"])
+    >>> sorted(ASSET_GROUPS.pop("doctest_round"))
+    ['dinner_plate', 'steamer_bottom']
+    """
+    if isinstance(assets, str):
+        raise InvalidInputError(f"asset group {name!r}: give a list of asset names, got the string {assets!r}")
+    ASSET_GROUPS[name] = frozenset(assets)
+
+
+def categories_of(names: Sequence[str], library: AssetLibrary) -> tuple[int, ...]:
+    """Categories of ``library`` that ``names`` stand for, ascending.
+
+    Args:
+        names: Asset names, display names in prompts ("steamer lid") or groups of :data:`ASSET_GROUPS`.
+        library: Assets of a scene type.
+
+    Raises:
+        UnknownNameError: a name is none of these; the nearest known one is offered.
+
+    >>> from scene_envs.assets import get_library
+    >>> categories_of(["fruit", "cup"], get_library(("apple_red", "teacup", "teapot")))
+    (0, 1)
+    """
+    found: set[int] = set()
+    for name in names:
+        members = {c for c, asset in enumerate(library) if name in (asset.name, asset.display_name)}
+        if not members and name not in ASSET_GROUPS:
+            known = [*library.names, *(asset.display_name for asset in library), *ASSET_GROUPS]
+            raise unknown_name("asset, display name or group", name, known)
+        group = ASSET_GROUPS.get(name, frozenset()) if not members else frozenset()
+        found |= members | {c for c, asset in enumerate(library) if asset.name in group}
+    return tuple(sorted(found))
+
+
+@dataclass(frozen=True)
+class Model:
+    """Result of a recipe: geometry in the asset frame, m.
+
+    Attributes:
+        visual: Coloured mesh.
+        fine: Convex parts that keep hollows hollow; they may touch, and should not overlap.
+        coarse: Fewer parts, without hollows.
+    """
+
+    visual: trimesh.Trimesh
+    fine: Sequence[ConvexPart]
+    coarse: Sequence[ConvexPart]
+
+
+Recipe = Callable[[], Model]
+
+
+@dataclass(frozen=True)
+class RecipeEntry:
+    """A recipe with the facts about its asset that are not geometry; see :func:`asset_recipe`."""
+
+    recipe: Recipe
+    display_name: str
+    plural: str
+    mass: float
+    color: tuple[int, int, int]
+
+
+RECIPES: dict[str, RecipeEntry] = {}
+"""Recipes registered so far, by asset name."""
+
+
+def asset_recipe(
+    name: str, *, display_name: str, mass: float, color: tuple[int, int, int], plural: str | None = None
+) -> Callable[[Recipe], Recipe]:
+    """Register the decorated function as the recipe of asset ``name``.
+
+    Args:
+        name: Identifier, unique in the library.
+        display_name: Name in prompts.
+        mass: Mass, kg; 0 makes the asset static.
+        color: Class colour (r, g, b) of semantic renders.
+        plural: Plural of the display name; the regular one by default.
+
+    Raises:
+        InvalidInputError: the name is taken, or the mass is negative.
+    """
+
+    def register(recipe: Recipe) -> Recipe:
+        if name in RECIPES:
+            raise InvalidInputError(f"an asset called {name!r} is registered already; choose another name")
+        if not mass >= 0:
+            raise InvalidInputError(f"asset {name!r}: mass must be 0 (static) or positive kg, got {mass}")
+        RECIPES[name] = RecipeEntry(recipe, display_name, plural or regular_plural(display_name), mass, color)
+        return recipe
+
+    return register

@@ -6,8 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from scene_envs.assets.base import Asset
-from scene_envs.assets.recipe import RECIPES, RecipeEntry
+from scene_envs.assets.base import RECIPES, Asset, RecipeEntry
 from scene_envs.assets.shapes import mass_properties
 from scene_envs.errors import unknown_name
 

@@ -6,10 +6,12 @@ corners lie on the nominal circle, so that a diameter is the distance between op
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
@@ -159,3 +161,290 @@ def mass_properties(parts: Iterable[ConvexPart], mass: float) -> MassProperties:
     covariance = second / (20.0 * total) - np.outer(center, center)
     inertia = mass * (np.trace(covariance) * np.eye(3) - covariance)
     return MassProperties(mass, center, 0.5 * (inertia + inertia.T))
+
+
+Color = tuple[int, int, int]
+"""(r, g, b) in 0..255."""
+
+_SMOOTH = np.cos(np.radians(40.0))
+"""Spans of a profile that meet at less than 40 degrees are shaded as one curved surface."""
+
+
+def surface(vertices: ArrayLike, faces: ArrayLike, color: Color, normals: ArrayLike | None = None) -> trimesh.Trimesh:
+    """One mesh of one colour; normals (V, 3) default to those of the faces around a vertex."""
+    vertices = np.asarray(vertices, dtype=np.float64)
+    colors = np.tile(np.array([*color, 255], dtype=np.uint8), (len(vertices), 1))
+    mesh = trimesh.Trimesh(vertices, np.asarray(faces), vertex_normals=normals, vertex_colors=colors, process=False)
+    mesh.vertex_normals  # noqa: B018  (computed here, so that joining keeps them)
+    return mesh
+
+
+def join(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
+    """One mesh of several; colours and normals are kept."""
+    starts = [0, *np.cumsum([len(mesh.vertices) for mesh in meshes[:-1]]).tolist()]
+    return trimesh.Trimesh(
+        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        faces=np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
+        vertex_normals=np.concatenate([mesh.vertex_normals for mesh in meshes]),
+        vertex_colors=np.concatenate([mesh.visual.vertex_colors for mesh in meshes]),  # type: ignore[union-attr]
+        process=False,
+    )
+
+
+def quad_faces(count: int) -> NDArray[np.int64]:
+    """(2 count, 3): two triangles for each of ``count`` quadrilaterals with corners 4 k .. 4 k + 3."""
+    first = 4 * np.arange(count)[:, None]
+    return np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
+
+
+def fan(count: int) -> NDArray[np.int64]:
+    """(count - 2, 3): triangles of a convex outline of ``count`` corners."""
+    return np.stack([np.zeros(count - 2, dtype=np.int64), np.arange(1, count - 1), np.arange(2, count)], axis=1)
+
+
+def grid_faces(rows: int, around: int) -> NDArray[np.int64]:
+    """(2 (rows - 1) around, 3): triangles between neighbouring rows of points, each row closed around."""
+    grid = np.arange(rows * around).reshape(rows, around)
+    a, b = grid[:-1], np.roll(grid[:-1], -1, axis=1)
+    d, c = grid[1:], np.roll(grid[1:], -1, axis=1)
+    return np.concatenate([np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)])
+
+
+def lathe(
+    profile: Profile, colors: Color | Sequence[Color], *, segments: int = 48, phase: float = 0.0, flat: bool = False
+) -> trimesh.Trimesh:
+    """Revolve an open or closed polyline of P points about z.
+
+    Args:
+        profile: Points (r, z), m, with the outside on the right: upward on the outside of a vessel, downward on its
+            inside.
+        colors: One colour, or one per span (P - 1).
+        segments: Number of facets around the axis.
+        phase: Angle of the first corner, rad.
+        flat: Whether facets stay visible (square dishes).
+    """
+    points = np.asarray(profile, dtype=np.float64)
+    steps = np.diff(points, axis=0)
+    steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+    spans = np.stack([steps[:, 1], -steps[:, 0]], axis=1)  # outward 2-D normals
+    palette = [colors] * len(spans) if isinstance(colors[0], int) else list(colors)
+    meshes = []
+    for index, normal in enumerate(spans):
+        ends = []
+        for neighbour in (index - 1, index + 1):
+            smooth = 0 <= neighbour < len(spans) and float(normal @ spans[neighbour]) > _SMOOTH
+            ends.append(normal + spans[neighbour] if smooth else normal)
+        meshes.append(_span(points[index], points[index + 1], ends, palette[index], segments, phase, flat))  # type: ignore[arg-type]
+    return join(*meshes)
+
+
+def _span(
+    low: Array, high: Array, normals: Sequence[Array], color: Color, segments: int, phase: float, flat: bool
+) -> trimesh.Trimesh:
+    unit = circle(segments, phase)
+    corners = [np.column_stack([r * unit, np.full(segments, z)]) for r, z in (low, high)]
+    here, there = np.arange(segments), (np.arange(segments) + 1) % segments
+    degenerate = np.array([low[0] == 0.0, high[0] == 0.0])
+    keep = np.repeat(~degenerate, segments)  # a span that starts or ends on the axis has half as many triangles
+    if flat:
+        quads = np.stack([corners[0], corners[0][there], corners[1][there], corners[1]], axis=1)
+        facing = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+        facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+        return surface(quads.reshape(-1, 3), quad_faces(segments)[keep], color, facing.repeat(4, axis=0))
+    faces = np.concatenate(
+        [np.stack([here, there, segments + there], axis=1), np.stack([here, segments + there, segments + here], axis=1)]
+    )
+    radial = [np.column_stack([n[0] * unit, np.full(segments, n[1])]) / np.linalg.norm(n) for n in normals]
+    return surface(np.concatenate(corners), faces[keep], color, np.concatenate(radial))
+
+
+def tube(path: ArrayLike, radii: ArrayLike, color: Color, *, sides: int = 10) -> trimesh.Trimesh:
+    """A round tube along a path (P, 3) in the x-z plane, with flat end caps; ``radii`` is one, or one per point."""
+    points = np.asarray(path, dtype=np.float64)
+    size = np.broadcast_to(np.asarray(radii, dtype=np.float64), (len(points),))
+    tangents = np.gradient(points, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    across = np.stack([tangents[:, 2], np.zeros(len(points)), -tangents[:, 0]], axis=1)
+    unit = circle(sides)
+    spokes = across[:, None] * unit[None, :, :1] + np.array([0.0, 1.0, 0.0]) * unit[None, :, 1:]  # (P, sides, 3)
+    vertices = points[:, None] + size[:, None, None] * spokes
+    body = surface(vertices.reshape(-1, 3), grid_faces(len(points), sides), color, spokes.reshape(-1, 3))
+    caps = [surface(vertices[0], fan(sides)[:, ::-1], color), surface(vertices[-1], fan(sides), color)]
+    return join(body, *caps)
+
+
+def planks(
+    radius: float, z: float, colors: Sequence[Color], *, count: int, rows: int, columns: int = 6
+) -> trimesh.Trimesh:
+    """A round board seen from above: ``count`` strips along y in turning colours.
+
+    Each strip is cut into ``rows`` x ``columns`` compact cells, because software renderers walk the
+    bounding box of each triangle.
+    """
+    edges = np.linspace(-radius, radius, count + 1)
+    along = np.linspace(-1.0, 1.0, rows + 1)
+    strips = []
+    for index, (left, right) in enumerate(pairwise(edges)):
+        x = np.linspace(left, right, columns + 1)
+        reach = np.sqrt(np.maximum(radius**2 - x**2, 0.0))
+        vertices = np.stack(
+            [np.repeat(x, rows + 1), np.outer(reach, along).ravel(), np.full(len(x) * (rows + 1), z)], axis=1
+        )
+        corner = (np.arange(len(x) - 1)[:, None] * (rows + 1) + np.arange(rows)).ravel()
+        across = corner + rows + 1
+        faces = np.concatenate(
+            [np.stack([corner, across, across + 1], axis=1), np.stack([corner, across + 1, corner + 1], axis=1)]
+        )
+        up = np.tile([0.0, 0.0, 1.0], (len(vertices), 1))
+        strips.append(surface(vertices, faces, colors[index % len(colors)], up))
+    return join(*strips)
+
+
+def arc(points: Sequence[tuple[float, float, float]], samples: int = 16) -> Array:
+    """(samples, 3): a smooth curve through the points, for the visual of handles and spouts."""
+    from scipy.interpolate import make_interp_spline
+
+    knots = np.asarray(points, dtype=np.float64)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
+    spline = make_interp_spline(length, knots, k=min(3, len(knots) - 1))
+    return np.asarray(spline(np.linspace(0.0, length[-1], samples)))
+
+
+Face = Literal["-x", "+x", "-y", "+y", "bottom", "top"]
+FACES: tuple[Face, ...] = ("-x", "+x", "-y", "+y", "bottom", "top")
+
+
+class Patch(NamedTuple):
+    """A coloured rectangle on a face, in fractions of its width and height as seen from outside."""
+
+    left: float
+    low: float
+    right: float
+    high: float
+    color: Color
+
+
+def painted_face(
+    corner: ArrayLike, along: ArrayLike, up: ArrayLike, color: Color, patches: Sequence[Patch] = ()
+) -> trimesh.Trimesh:
+    """A rectangle with patches on it; later patches cover earlier ones.
+
+    Args:
+        corner: (3,) lower left corner, m.
+        along: (3,) vector from there to the lower right corner, m.
+        up: (3,) vector from there to the upper left corner, m; ``along x up`` points outward.
+        color: Colour of the background.
+        patches: Patches painted on the rectangle.
+    """
+    start, right, rise = (np.asarray(v, dtype=np.float64) for v in (corner, along, up))
+    across = np.unique(np.clip([0.0, 1.0, *(e for p in patches for e in (p.left, p.right))], 0.0, 1.0))
+    upward = np.unique(np.clip([0.0, 1.0, *(e for p in patches for e in (p.low, p.high))], 0.0, 1.0))
+    u, v = 0.5 * (across[1:] + across[:-1]), 0.5 * (upward[1:] + upward[:-1])
+    palette = [color, *(patch.color for patch in patches)]
+    owner = np.zeros((len(u), len(v)), dtype=int)
+    for index, patch in enumerate(patches, start=1):
+        inside = ((u > patch.left) & (u < patch.right))[:, None] & ((v > patch.low) & (v < patch.high))[None]
+        owner[inside] = index
+    normal = np.cross(right, rise)
+    normal /= np.linalg.norm(normal)
+    meshes = []
+    for index, cells in _rectangles(owner).items():
+        left, low, end, high = np.array(cells).T
+        ends = [(across[a], upward[b]) for a, b in ((left, low), (end, low), (end, high), (left, high))]
+        corners = np.stack([start + u[:, None] * right + v[:, None] * rise for u, v in ends], axis=1)  # (cells, 4, 3)
+        normals = np.tile(normal, (4 * len(cells), 1))
+        meshes.append(surface(corners.reshape(-1, 3), quad_faces(len(cells)), palette[index], normals))
+    return join(*meshes)
+
+
+def _rectangles(owner: NDArray[np.int64]) -> dict[int, list[tuple[int, int, int, int]]]:
+    """Rectangles (left, low, right, high) of cells, by owner; ``right`` and ``high`` are exclusive.
+
+    Strips of one owner that have the same ends in successive rows are joined.
+    """
+    joined: dict[int, list[tuple[int, int, int, int]]] = {}
+    open_strips: dict[tuple[int, int, int], int] = {}
+    for j in range(owner.shape[1] + 1):
+        strips: set[tuple[int, int, int]] = set()
+        if j < owner.shape[1]:
+            starts = np.concatenate([[0], np.flatnonzero(np.diff(owner[:, j])) + 1, [len(owner)]])
+            strips = {(int(owner[a, j]), int(a), int(b)) for a, b in pairwise(starts)}
+        for strip in sorted(set(open_strips) - strips):
+            index, a, b = strip
+            joined.setdefault(index, []).append((a, open_strips.pop(strip), b, j))
+        for strip in strips:
+            open_strips.setdefault(strip, j)
+    return joined
+
+
+def painted_box(
+    size: tuple[float, float, float],
+    color: Color | Mapping[Face, Color],
+    art: Mapping[Face, Sequence[Patch]] | None = None,
+    *,
+    base: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    front: Literal["-y", "+x"] = "-y",
+) -> trimesh.Trimesh:
+    """An axis-aligned box with a colour, and optionally a pattern, per face.
+
+    Args:
+        size: (x, y, z) side lengths, m.
+        color: One colour, or one per face (all six).
+        art: Patches per face.
+        base: Centre of the bottom face, m.
+        front: Side from which the top is seen upright.
+    """
+    colors = color if isinstance(color, Mapping) else dict.fromkeys(FACES, color)
+    x, y, z = np.diag(np.asarray(size, dtype=np.float64))
+    low = np.asarray(base, dtype=np.float64) - 0.5 * (x + y)
+    frames: dict[Face, tuple[Array, Array, Array]] = {
+        "-x": (low + y, -y, z),
+        "+x": (low + x, y, z),
+        "-y": (low, x, z),
+        "+y": (low + x + y, -x, z),
+        "bottom": (low + y, x, -y),
+        "top": (low + z, x, y) if front == "-y" else (low + x + z, y, -x),
+    }
+    patterns = art or {}
+    return join(*(painted_face(*frames[face], colors[face], patterns.get(face, ())) for face in FACES))
+
+
+def lettering(
+    left: float, low: float, right: float, high: float, color: Color, widths: Sequence[float] = (1.0,) * 6
+) -> list[Patch]:
+    """Patches that look like a line of large letters: bars of these relative widths with gaps between."""
+    gap = 0.34
+    total = sum(widths) + gap * (len(widths) - 1)
+    patches, x = [], left
+    for width in widths:
+        step = (right - left) / total
+        patches.append(Patch(x, low, x + width * step, high, color))
+        x += (width + gap) * step
+    return patches
+
+
+def loft(sections: ArrayLike, color: Color, *, caps: tuple[bool, bool] = (True, True)) -> trimesh.Trimesh:
+    """A smooth skin through P sections of K points each (P, K, 3), m, with flat caps at its first and last end.
+
+    The points run counter-clockwise when seen from the last section looking back at the first.
+    """
+    grid = np.asarray(sections, dtype=np.float64)
+    count, around = grid.shape[:2]
+    ends = [surface(grid[0], fan(around)[:, ::-1], color), surface(grid[-1], fan(around), color)]
+    return join(
+        surface(grid.reshape(-1, 3), grid_faces(count, around), color),
+        *(end for end, kept in zip(ends, caps, strict=True) if kept),
+    )
+
+
+def moved(mesh: trimesh.Trimesh, rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    """The mesh at another pose: rotation (3, 3), then translation (3,) m; colours are kept."""
+    turn = np.asarray(rotation, dtype=np.float64)
+    visual: Any = mesh.visual
+    return trimesh.Trimesh(
+        vertices=mesh.vertices @ turn.T + np.asarray(translation),
+        faces=mesh.faces,
+        vertex_normals=mesh.vertex_normals @ turn.T,
+        vertex_colors=visual.vertex_colors,
+        process=False,
+    )

@@ -1,11 +1,10 @@
 """Datasets of scenes: generation from grammars, files, prompts, unions."""
 
-from scene_envs.datasets.dataset import SceneDataset
+from scene_envs.datasets.dataset import SceneDataset, to_union
+from scene_envs.datasets.files import DatasetInfo, read_metadata
 from scene_envs.datasets.generate import GenerationReport, generate
-from scene_envs.datasets.info import DatasetInfo, read_metadata
 from scene_envs.datasets.prompts import PromptFacts, SceneFacts, describe, describe_all, parse_prompt, scene_facts
-from scene_envs.datasets.union import to_union
-from scene_envs.datasets.verification import judge_scenes
+from scene_envs.datasets.shards import judge_scenes
 from scene_envs.errors import StorageError
 
 __all__ = [

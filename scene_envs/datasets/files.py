@@ -4,17 +4,145 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from scene_envs.datasets.store import METADATA, PROMPTS, PROMPT_SETS, SCENES, open_parquet
-from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
+from scene_envs.files import replacing, with_digest, without_digest
+from scene_envs.normalizer import Normalizer
+from scene_envs.scene import POSE_FEATURES
+from scene_envs.scene_types import SceneType
+
+METADATA = "metadata.json"
+SCENES = "scenes"
+PROMPTS = "language_annotation"
+PROMPT_SETS = "language_annotations"
+_NOTES = b"scene_envs"
+_MODEL_PATH = "scene_envs/assets/{name}"
+_ROW_GROUP = 500
+"""Scenes per row group, the unit that a streaming reader holds in memory."""
+
+
+def shard_name(index: int) -> str:
+    """File name of shard ``index``."""
+    return f"scenes-{index:05d}.parquet"
+
+
+def make_metadata(scene_type: SceneType, normalizer: Normalizer, **extra: Any) -> dict[str, Any]:
+    """The content of ``metadata.json`` for a dataset of ``scene_type``, with the ``extra`` keys."""
+    return {
+        "scene_type": scene_type.name,
+        "model_paths": [_MODEL_PATH.format(name=name) for name in scene_type.assets],
+        "welded_object_model_paths": [_MODEL_PATH.format(name=name) for name in scene_type.welded],
+        "translation_vec_len": 3,
+        "rotation_parametrization": "rotation_matrix",
+        "model_path_vec_len": scene_type.num_assets + 1,
+        "max_num_objects_per_scene": scene_type.slots,
+        "normalizer_state": normalizer.state(),
+        **extra,
+    }
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write one file, whole or not at all; raises :class:`StorageError`."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
+def write_shard(
+    path: Path, scenes: NDArray[np.float32], prompt_sets: Sequence[tuple[str, ...]], notes: Mapping[str, Any]
+) -> None:
+    """Write one parquet file atomically.
+
+    Args:
+        path: Path of the file.
+        scenes: (M, N, D) float32, normalised.
+        prompt_sets: Prompts of each of the M scenes; ``language_annotations`` is left out when all have one.
+        notes: JSON-able facts for the file's footer, such as reasons for rejected scenes.
+
+    Raises:
+        StorageError: the file cannot be written; nothing is left of it.
+    """
+    write_bytes(path, encode_shard(scenes, prompt_sets, notes))
+
+
+def encode_shard(
+    scenes: NDArray[np.float32], prompt_sets: Sequence[tuple[str, ...]], notes: Mapping[str, Any]
+) -> bytes:
+    """The bytes of the parquet file that :func:`write_shard` writes; equal for equal arguments."""
+    count, slots, features = scenes.shape
+    values = pa.array(np.ascontiguousarray(scenes).reshape(-1))
+    rows = pa.ListArray.from_arrays(pa.array(np.arange(count * slots + 1, dtype=np.int32) * features), values)
+    columns: dict[str, pa.Array] = {
+        SCENES: pa.ListArray.from_arrays(pa.array(np.arange(count + 1, dtype=np.int32) * slots), rows),
+        PROMPTS: pa.array([prompts[0] for prompts in prompt_sets], pa.string()),
+    }
+    if any(len(prompts) > 1 for prompts in prompt_sets):
+        columns[PROMPT_SETS] = pa.array([list(prompts) for prompts in prompt_sets], pa.list_(pa.string()))
+    kept = json.dumps(with_digest({**notes, "rows": count}), sort_keys=True)
+    table = pa.table(columns).replace_schema_metadata({_NOTES: kept.encode()})
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd", row_group_size=_ROW_GROUP, write_page_checksum=True)
+    return bytes(sink.getvalue().to_pybytes())
+
+
+def read_notes(path: Path) -> dict[str, Any]:
+    """The facts that :func:`write_shard` kept in the footer, and ``rows``; raises CorruptFileError."""
+    file = open_parquet(path)
+    footer = file.schema_arrow.metadata or {}
+    try:
+        notes = without_digest(json.loads(footer.get(_NOTES, b"{}")), path)
+        rows = file.metadata.num_rows
+        if notes.get("rows", rows) != rows:
+            raise ValueError(f"{notes['rows']} rows were written, the file has {rows}")
+        return {**notes, "rows": rows}
+    except (ValueError, TypeError, AttributeError, CorruptFileError) as error:
+        raise CorruptFileError(
+            f"{str(path)!r} has a damaged footer; delete it and generate again to remake it"
+        ) from error
+
+
+def verify(path: Path) -> None:
+    """Read all of a shard, whose pages carry checksums; raises CorruptFileError."""
+    file = open_parquet(path)
+    try:
+        for _ in file.iter_batches(_ROW_GROUP):
+            pass
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise CorruptFileError(
+            f"{str(path)!r} is damaged ({str(error)[:200]}); delete it and generate again to remake it"
+        ) from error
+
+
+def open_parquet(path: Path) -> pq.ParquetFile:
+    """The parquet file at ``path``; raises InvalidInputError (none there) or CorruptFileError."""
+    try:
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        _ = file.schema_arrow.names, file.metadata.num_rows  # reading these raises when they are damaged
+        return file
+    except FileNotFoundError:
+        raise InvalidInputError(f"no parquet file at {str(path)!r}") from None
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise CorruptFileError(
+            f"{str(path)!r} is not a readable parquet file ({error}); delete it and generate again to remake it"
+        ) from error
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove files that killed processes left half-written in ``folder``."""
+    for path in folder.glob(".*.partial"):
+        path.unlink(missing_ok=True)
+
 
 _STATE, _SPLITS = "state.json", "dataset_dict.json"
 _SUFFIXES = (".parquet", ".arrow")
@@ -250,3 +378,130 @@ def _check_complete(lists: pa.Array, start: int, what: str, per_row: int = 1) ->
     if lists.null_count:
         row = start + int(np.flatnonzero(np.asarray(lists.is_null()))[0]) // per_row
         raise ValueError(f"row {row} has a missing {what}")
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetInfo:
+    """The content of one ``metadata.json``.
+
+    Attributes:
+        path: Path of the file.
+        model_paths: C paths; the position of a path is its category *in the files*, C is empty.
+        normalizer: Normalizer of the files, with D = 3 + 9 + C + 1 features in the files' order.
+        welded_model_paths: Paths of the welded assets.
+        slots: N, the number of slots per scene; None when the file does not say.
+        scene_type: Name of the scene type; None in datasets of others.
+        count: Number of requested scenes; None when the file does not say.
+        metadata: All keys of the file but the digest.
+    """
+
+    path: Path
+    model_paths: tuple[str, ...]
+    normalizer: Normalizer
+    welded_model_paths: tuple[str, ...] = ()
+    slots: int | None = None
+    scene_type: str | None = None
+    count: int | None = None
+    metadata: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def features(self) -> int:
+        """D, the length of a slot in the files."""
+        return POSE_FEATURES + len(self.model_paths) + 1
+
+    @property
+    def stems(self) -> tuple[str, ...]:
+        """The names in the model paths, without folder and suffix: ``"package://a/teacup.sdf"`` is ``"teacup"``."""
+        return tuple(Path(path).stem for path in self.model_paths)
+
+    def categories_in(self, scene_type: SceneType, aliases: Mapping[str, str] | None = None) -> Tensor:
+        """(C + 1,) int64: the category of ``scene_type`` for each category of the files; empty maps to empty.
+
+        Args:
+            scene_type: Scene type of the result; it may have assets that the files lack.
+            aliases: Mapping of model paths, or their stems, to asset names.
+
+        Raises:
+            UnknownNameError: a model path that is no asset of the scene type.
+        """
+        aliases = aliases or {}
+        found = []
+        for path, stem in zip(self.model_paths, self.stems, strict=True):
+            whole = Path(path).name  # paths of this package have no suffix, but a name may hold a dot
+            name = aliases.get(path, aliases.get(stem, whole if whole in scene_type.assets else stem))
+            if name not in scene_type.assets:
+                kind = f"asset of {scene_type.name!r} (model path {path!r} in {str(self.path)!r}; pass aliases=)"
+                raise unknown_name(kind, name, scene_type.assets)
+            found.append(scene_type.assets.index(name))
+        return torch.tensor([*found, scene_type.num_assets])
+
+
+def read_metadata(path: str | os.PathLike[str]) -> DatasetInfo:
+    """Read a ``metadata.json``, given as the file or as the dataset's folder.
+
+    Raises:
+        InvalidInputError: there is no such file.
+        CorruptFileError: it is not JSON, does not match its digest, lacks keys (they are named), or its lengths
+            contradict each other.
+    """
+    file = Path(path) / METADATA if Path(path).is_dir() else Path(path)
+    if not file.is_file():
+        raise InvalidInputError(f"no {METADATA} at {str(file)!r}; a dataset folder holds one")
+    try:
+        metadata = json.loads(file.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CorruptFileError(f"{str(file)!r} is not valid JSON: {error}") from error
+    if isinstance(metadata, dict):
+        metadata = without_digest(metadata, file)
+    needed = ("model_paths", "normalizer_state")
+    missing = [key for key in needed if not isinstance(metadata, dict) or key not in metadata]
+    if missing:
+        raise CorruptFileError(f"{str(file)!r} lacks the keys {missing}; a dataset's metadata needs {list(needed)}")
+    return _parse(file, metadata)
+
+
+def _parse(file: Path, metadata: dict[str, Any]) -> DatasetInfo:
+    for key in ("model_paths", "welded_object_model_paths"):
+        if not isinstance(metadata.get(key) or [], list):
+            raise CorruptFileError(f"{str(file)!r}: {key} must be a list of paths, it is {str(metadata[key])[:100]}")
+    paths = tuple(map(str, metadata["model_paths"] or ()))
+    try:
+        normalizer = Normalizer.from_state(metadata["normalizer_state"])
+        slots, count = (_whole(metadata, key) for key in ("max_num_objects_per_scene", "count"))
+    except (InvalidInputError, TypeError, ValueError) as error:
+        raise CorruptFileError(f"{str(file)!r}: {error}") from error
+    for key, wanted in (("translation_vec_len", 3), ("model_path_vec_len", len(paths) + 1)):
+        found = metadata.get(key, wanted)
+        if found != wanted:
+            raise CorruptFileError(f"{str(file)!r}: {key} is {found}, expected {wanted} ({len(paths)} model paths)")
+    return DatasetInfo(
+        path=file,
+        model_paths=paths,
+        normalizer=_whole_slot(normalizer, len(paths) + 1, file),
+        welded_model_paths=tuple(map(str, metadata.get("welded_object_model_paths") or ())),
+        slots=slots,
+        scene_type=metadata.get("scene_type"),
+        count=count,
+        metadata=metadata,
+    )
+
+
+def _whole(metadata: dict[str, Any], key: str) -> int | None:
+    value = metadata.get(key)
+    return None if value is None else int(value)
+
+
+def _whole_slot(normalizer: Normalizer, one_hot: int, file: Path) -> Normalizer:
+    """The normalizer of a whole slot; a pose-only one is extended by the identity on the one-hot features."""
+    vectors = (normalizer.scale, normalizer.min, normalizer.input_min, normalizer.input_max)
+    lengths = {len(vector) for vector in vectors}
+    if lengths == {POSE_FEATURES}:
+        kept = (torch.ones, torch.zeros, torch.zeros, torch.ones)
+        return Normalizer(*(torch.cat([v, make(one_hot)]) for v, make in zip(vectors, kept, strict=True)))
+    if lengths != {POSE_FEATURES + one_hot}:
+        raise CorruptFileError(
+            f"{str(file)!r}: the normalizer has {sorted(lengths)} features; {one_hot - 1} model paths need "
+            f"{POSE_FEATURES + one_hot} (3 translation, 9 rotation matrix, {one_hot} one-hot), or the first "
+            f"{POSE_FEATURES}"
+        )
+    return normalizer

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -13,14 +15,109 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.datasets.store import encode_shard, write_bytes
-from scene_envs.datasets.journal import Journal
+from scene_envs.datasets.files import encode_shard, write_bytes
 from scene_envs.datasets.prompts import describe_all
-from scene_envs.datasets.verification import KEPT, judge_scenes
 from scene_envs.errors import PhysicsError
+from scene_envs.files import storage_error
 from scene_envs.grammars import Grammar
 from scene_envs.normalizer import Normalizer
+from scene_envs.progress import Progress
 from scene_envs.scene import SceneBatch
+
+
+class Journal:
+    """An append-only text file with the number of a candidate and its verdict per line.
+
+    A process may be killed while it writes, so an incomplete last line is dropped. Two processes that make the same
+    shard may write by turns, because a worker may outlive its killed parent for a moment; a verdict that is written
+    twice counts once. The first :meth:`append` makes the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def read(self) -> list[str]:
+        """The verdicts on candidates 0, 1, … so far; an incomplete last line is cut off the file.
+
+        Raises:
+            StorageError: the file cannot be read or written.
+        """
+        try:
+            content = self.path.read_bytes()
+            whole = content[: content.rfind(b"\n") + 1]
+            if len(whole) < len(content):
+                self.path.write_bytes(whole)
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise storage_error(self.path, error) from error
+        verdicts: list[str] = []
+        for line in whole.decode(errors="replace").split("\n")[:-1]:
+            candidate, _, verdict = line.partition(" ")
+            if candidate == str(len(verdicts)):
+                verdicts.append(verdict)
+        return verdicts
+
+    def append(self, first: int, verdicts: Sequence[str]) -> None:
+        """Add the verdicts on candidates ``first``, ``first + 1``, …
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        lines = "".join(f"{candidate} {verdict}\n" for candidate, verdict in enumerate(verdicts, start=first))
+        try:
+            with self.path.open("ab") as file:
+                file.write(lines.encode())
+        except OSError as error:
+            raise storage_error(self.path, error) from error
+
+    def remove(self) -> None:
+        """Delete the file, when the shard is written."""
+        self.path.unlink(missing_ok=True)
+
+
+MAX_PENETRATION = 1e-3
+"""Deepest overlap (m) of any pair of objects in a kept scene."""
+MAX_DISPLACEMENT = 1e-2
+"""Largest motion (m) of any object of a kept scene while it settles."""
+DURATION = 0.5
+"""Time (s) for which a scene settles."""
+KEPT = ""
+"""The verdict on a scene that is kept."""
+
+
+def judge_scenes(batch: SceneBatch) -> list[str]:
+    """Reason why each scene is rejected: ``"outside workspace"``, ``"penetration"``, … or :data:`KEPT`.
+
+    Runs in the calling process. Scenes are judged in the constructed poses; settling only tests them. The verdict on
+    a scene does not depend on the others of the batch.
+    """
+    inside = (batch.in_workspace | batch.is_empty).all(dim=1)
+    verdicts = [KEPT if ok else "outside workspace" for ok in inside.tolist()]
+    candidates = torch.nonzero(inside).flatten()
+    if len(candidates):
+        for index, verdict in zip(candidates.tolist(), _physics(batch[candidates]), strict=True):
+            verdicts[index] = verdict
+    return verdicts
+
+
+def _physics(batch: SceneBatch) -> list[str]:
+    from scene_envs.physics import feasibility
+
+    result = feasibility(
+        batch,
+        max_penetration=MAX_PENETRATION,
+        max_displacement=MAX_DISPLACEMENT,
+        max_rotation=math.inf,
+        duration=DURATION,
+    )
+    shallow = (result.depth <= MAX_PENETRATION).all(dim=1)
+    still = ((result.displacement <= MAX_DISPLACEMENT) | ~batch.is_free).all(dim=1)
+    return [
+        "physics failed" if not valid else "penetration" if not clear else "moved while settling" if not calm else KEPT
+        for valid, clear, calm in zip(result.valid.tolist(), shallow.tolist(), still.tolist(), strict=True)
+    ]
+
 
 _MAX_CHUNK = 32
 """Largest number of scenes judged at a time."""
@@ -139,3 +236,40 @@ def shard_journal(job: Job) -> Journal:
     """The journal of a shard, in the folder of its file."""
     path = Path(job.path)
     return Journal(path.with_name(f".{path.name}.journal"))
+
+
+Report = Callable[[int, int, dict[str, int]], None]
+"""Called with (scenes kept, scenes tried, reasons) since the last call."""
+
+_EVERY = 30.0
+"""Seconds between lines where there is no terminal."""
+
+
+@contextmanager
+def generation_progress(title: str, done: int, count: int, show: bool | str) -> Iterator[Report]:
+    """A live bar with scenes/s and the most frequent reasons; yields the function that advances it.
+
+    On a terminal the bar is on stderr; elsewhere (a log file) a line is printed every 30 s.
+
+    Args:
+        title: Title of the bar.
+        done: Number of scenes that exist already.
+        count: Number of requested scenes.
+        show: Style of the display; True for a bar, False for none.
+    """
+    totals: Counter[str] = Counter()
+    kept = 0
+    style = show if isinstance(show, str) else ("bar" if show else "none")
+    with Progress(title, count, done=done, style=style, every=_EVERY) as progress:
+
+        def report(fresh: int, tried: int, reasons: dict[str, int]) -> None:
+            nonlocal kept
+            kept += fresh
+            totals.update(reasons)
+            rate = f"{kept / max(progress.seconds, 1e-9):.1f} scenes/s"
+            dropped = ", ".join(f"{name} {number}" for name, number in totals.most_common(3))
+            line = f"{title}: {done + kept}/{count}, {rate}"
+            progress.update(done + kept, f"{rate} [dim]{dropped}", f"{line}, {dropped}" if dropped else line)
+
+        yield report
+        progress.update(count, f"{kept / max(progress.seconds, 1e-9):.1f} scenes/s")

@@ -7,22 +7,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from scene_envs.lazy import lazy_names
+from scene_envs.registry import lazy_names
 
 if TYPE_CHECKING:
     from scene_envs.envs.branchable import NotBranchableError, check_branchable
-    from scene_envs.envs.denoising import DenoisingCore
-    from scene_envs.envs.denoising_gymnasium import DenoisingEnv
-    from scene_envs.envs.denoising_torchrl import DenoisingTorchRLEnv
-    from scene_envs.envs.denoising_vector import DenoisingVectorEnv
-    from scene_envs.envs.errors import ResetNeededError
+    from scene_envs.envs.denoising import DenoisingCore, StepResult
+    from scene_envs.envs.denoising_adapters import DenoisingEnv, DenoisingTorchRLEnv, DenoisingVectorEnv
     from scene_envs.envs.masks import MaskGenerator, list_masks, register_mask
     from scene_envs.envs.scoring import Score
-    from scene_envs.envs.search import SearchProblem, SearchState
-    from scene_envs.envs.search_gymnasium import SearchEnv
-    from scene_envs.envs.search_masks import MaskChoiceProblem, MaskChoiceState
-    from scene_envs.envs.search_masks_gymnasium import SearchMaskEnv
-    from scene_envs.envs.trajectories import StepResult
+    from scene_envs.envs.search import MaskChoiceProblem, MaskChoiceState, SearchProblem, SearchState
+    from scene_envs.envs.search_gymnasium import SearchEnv, SearchMaskEnv
+    from scene_envs.envs.spaces import ResetNeededError
 
 __all__ = [
     "DenoisingCore",

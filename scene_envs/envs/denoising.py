@@ -7,18 +7,18 @@ the noise of the prior's own reverse step instead, so that actions from N(0, I) 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.envs.errors import ResetNeededError
-from scene_envs.envs.prompts import EnvPrompts
-from scene_envs.envs.scoring import RewardScorer
+from scene_envs.envs.scoring import EnvPrompts, RewardScorer, Score
 from scene_envs.envs.settings import DenoisingSettings, takes
 from scene_envs.envs.spaces import (
     STATE_BOUND,
+    ResetNeededError,
     check_action,
     check_slots,
     decode_scenes,
@@ -27,9 +27,46 @@ from scene_envs.envs.spaces import (
     prior_features,
     resolve_scene_and_prior,
 )
-from scene_envs.envs.trajectories import BoolArray, IntArray, StepResult, replace_rows, take_rows
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+
+BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """Result of one step of the B episodes of a core.
+
+    Attributes:
+        reward: (B,) float32; 0 before the last step and where ``valid`` is False.
+        valid: (B,) bool; False where the reward could not score the finished scene.
+        terminated: (B,) bool, on the CPU.
+        terms: named (B,) float32 of the reward; 0 before the last step.
+        score: the full verdict, when all B episodes ended in this step; else None.
+        batch: the B finished scenes, likewise.
+    """
+
+    reward: Tensor
+    valid: Tensor
+    terminated: BoolArray
+    terms: dict[str, Tensor]
+    score: Score | None = None
+    batch: SceneBatch | None = None
+
+
+def take_rows(x: Tensor, rows: IntArray) -> Tensor:
+    """``x[rows]`` without a copy when ``rows`` are all of them."""
+    return x if len(rows) == x.shape[0] else x[torch.from_numpy(rows).to(x.device)]
+
+
+def replace_rows(x: Tensor, rows: IntArray, values: Tensor) -> Tensor:
+    """A new tensor: ``x`` with ``rows`` (ascending) set to ``values``."""
+    if len(rows) == x.shape[0]:
+        return values
+    changed = x.clone()
+    changed[torch.from_numpy(rows).to(x.device)] = values
+    return changed
 
 
 class DenoisingCore:
@@ -42,7 +79,7 @@ class DenoisingCore:
     Args:
         num_envs: B.
         **settings: fields of :class:`~scene_envs.envs.settings.DenoisingSettings`; ``prompt`` and ``guidance`` as for
-            :class:`~scene_envs.envs.prompts.EnvPrompts`.
+            :class:`~scene_envs.envs.scoring.EnvPrompts`.
 
     Raises:
         InvalidInputError, UnknownNameError: an argument is outside what is accepted.

@@ -3,20 +3,321 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.envs.mask_generators import BalancedMask, CulpritsMask, EmptyMask, ExplicitMask, LowestScoringMask, OffPromptMask, RegionMask, blamed_or_empty_mask, infeasible_mask, infeasible_or_empty_mask, penetrating_mask, random_mask, unstable_mask
-from scene_envs.envs.scoring import Score
+from scene_envs.envs.scoring import Score, resolve_reward
 from scene_envs.errors import InvalidInputError, SceneEnvsError, unknown_name
-from scene_envs.plugins import load_plugin
-from scene_envs.registry import Registry
+from scene_envs.registry import Registry, load_plugin
 from scene_envs.scene import SceneBatch
+
+MAX_PENETRATION = 1e-3
+"""Object pairs that overlap deeper than this (m) count as overlapping, as in feasibility."""
+
+
+def bad_objects(scene: SceneBatch, score: Score) -> Tensor | None:
+    """(N,) bool: free objects that the objective blames, or None when it does not judge single objects.
+
+    An object is blamed when the objective's flag ``feasible`` is False for it or, lacking that flag, when its
+    credit per object is not positive.
+    """
+    if "feasible" in score.object_flags:
+        return scene.is_free[0] & ~score.object_flags["feasible"][0]
+    if score.per_object is not None:
+        return scene.is_free[0] & (score.per_object[0] <= 0)
+    return None
+
+
+def infeasible_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """The free objects that physics calls infeasible, under any objective; none when all are feasible.
+
+    The verdict is the objective's flag ``feasible`` where the objective has one. Otherwise it is the flag of the reward
+    ``feasible_objects``, which keeps its verdicts, so that no scene is simulated twice.
+    """
+    flags = score.object_flags.get("feasible")
+    if flags is None:
+        flags = resolve_reward("feasible_objects")(scene).object_flags["feasible"]
+    return scene.is_free[0] & ~flags[0]
+
+
+def penetrating_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """The free objects that are more than 1 mm inside another object."""
+    mask = torch.zeros_like(scene.is_empty[0])
+    mask[sorted({slot for pair in _overlaps(scene) for slot in pair})] = True
+    return mask & scene.is_free[0]
+
+
+def unstable_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """The infeasible objects that overlap nothing: they fall, slide, or are outside the workspace."""
+    return infeasible_mask(scene, score, rng) & ~penetrating_mask(scene, score, rng)
+
+
+def infeasible_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """The infeasible objects and all empty slots, as in Pfaff et al. (2025)."""
+    return infeasible_mask(scene, score, rng) | scene.is_empty[0]
+
+
+def blamed_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """The free objects that the objective blames, and all empty slots.
+
+    With an objective that counts feasible objects this is :func:`infeasible_or_empty_mask`. Where the objective does
+    not judge single objects, or blames none of a full scene, it is :func:`random_mask`.
+    """
+    bad = bad_objects(scene, score)
+    if bad is None or not bool((bad | scene.is_empty[0]).any()):
+        return random_mask(scene, score, rng)
+    return bad | scene.is_empty[0]
+
+
+def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+    """A random half of the free objects (rounded up), and all empty slots."""
+    free = torch.nonzero(scene.is_free[0]).flatten().numpy()
+    chosen = rng.choice(free, size=(len(free) + 1) // 2, replace=False)
+    mask = scene.is_empty[0].clone()
+    mask[torch.from_numpy(chosen)] = True
+    return mask
+
+
+def check_count(mask: str, key: str, value: Any) -> None:
+    """Refuse a number of slots that is neither None (all) nor a whole number of at least 0."""
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 0):
+        raise InvalidInputError(f"mask={mask}: {key}={value!r} must be a whole number of at least 0")
+
+
+@dataclass(frozen=True)
+class EmptyMask:
+    """Empty slots, and no object: ``count`` of them at random, or all with None."""
+
+    count: int | None = None
+
+    def __post_init__(self) -> None:
+        check_count("empty", "count", self.count)
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        return _some(scene.is_empty[0], scene.tensor.shape[1] if self.count is None else self.count, rng)
+
+
+@dataclass(frozen=True)
+class LowestScoringMask:
+    """The ``count`` free objects of the lowest credit, ties at random.
+
+    Raises:
+        InvalidInputError: the objective gives no credit per object.
+    """
+
+    count: int = 4
+
+    def __post_init__(self) -> None:
+        check_count("lowest_scoring", "count", self.count)
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        if score.per_object is None:
+            raise InvalidInputError(
+                "mask=lowest_scoring needs an objective with credit per object; choose another mask"
+            )
+        credit = score.per_object[0].double().masked_fill(~scene.is_free[0], torch.inf).cpu().numpy()
+        order = np.lexsort((rng.random(len(credit)), credit))[: self.count]
+        mask = torch.zeros_like(scene.is_empty[0])
+        mask[torch.from_numpy(order)] = True
+        return mask & scene.is_free[0]
+
+
+@dataclass(frozen=True)
+class RegionMask:
+    """The free objects whose frames are in a box of the workspace, and some empty slots.
+
+    Args:
+        low: Smallest x, y, z, m.
+        high: Largest x, y, z, m.
+        empty: Number of empty slots that are added at random.
+    """
+
+    low: Sequence[float] = (-np.inf, -np.inf, -np.inf)
+    high: Sequence[float] = (np.inf, np.inf, np.inf)
+    empty: int = 4
+
+    def __post_init__(self) -> None:
+        if len(self.low) != 3 or len(self.high) != 3 or any(a > b for a, b in zip(self.low, self.high, strict=True)):
+            raise InvalidInputError(f"mask=region: low={self.low} and high={self.high} are no corners x, y, z of a box")
+        check_count("region", "empty", self.empty)
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        place = scene.translations[0]
+        inside = ((place >= torch.tensor(self.low)) & (place <= torch.tensor(self.high))).all(dim=-1)
+        return (inside & scene.is_free[0]) | _some(scene.is_empty[0], self.empty, rng)
+
+
+@dataclass(frozen=True)
+class ExplicitMask:
+    """Slots that the user lists by their indices."""
+
+    slots: Sequence[int] = ()
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        mask = torch.zeros_like(scene.is_empty[0])
+        outside = [slot for slot in self.slots if not 0 <= slot < len(mask)]
+        if outside or not self.slots:
+            raise InvalidInputError(f"mask=explicit: slots={list(self.slots)} must be some of 0..{len(mask) - 1}")
+        mask[list(self.slots)] = True
+        return mask
+
+
+@dataclass(frozen=True)
+class OffPromptMask:
+    """Objects that contradict a prompt, and empty slots for objects that are missing.
+
+    These are the objects beyond the numbers in the prompt, both objects of a relation that does not hold, and one empty
+    slot for each missing object. Without a ``prompt`` of its own, the mask takes the prompt of the search.
+    """
+
+    prompt: str | None = None
+
+    def for_prompt(self, prompt: str | None) -> OffPromptMask:
+        """The mask for scenes of ``prompt``; a mask that has a prompt already keeps it."""
+        return self if self.prompt is not None else OffPromptMask(prompt)
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated; none when the scene follows the prompt.
+
+        Raises:
+            InvalidInputError: there is no prompt, or it cannot be read.
+        """
+        from scene_envs.datasets import parse_prompt, scene_facts
+
+        if self.prompt is None:
+            raise InvalidInputError("mask=off_prompt has no prompt: give prompt= to the search, or to the mask")
+        claims = parse_prompt(self.prompt, scene.scene_type)
+        (facts,) = scene_facts(scene)
+        mask, missing, named = torch.zeros_like(scene.is_empty[0]), 0, set[int]()
+        for check in claims.check(facts):
+            free = [slot for slot in check.slots if bool(scene.is_free[0, slot])]
+            if hasattr(check.claim, "name"):
+                named.update(free)
+            if check.holds:
+                continue
+            relation = not hasattr(check.claim, "number")
+            surplus = len(free) if relation else check.found - check.expected
+            if surplus > 0:  # objects that the prompt does not name go first
+                order = sorted(rng.permutation(free).tolist(), key=lambda slot: slot in named)
+                mask[order[:surplus]] = True
+            missing += max(0, check.expected - check.found)
+        return mask | _some(scene.is_empty[0], missing, rng)
+
+
+@dataclass(frozen=True)
+class CulpritsMask:
+    """A smallest set of objects whose replacement ends all overlaps, and a few empty slots.
+
+    An objective that counts feasible objects blames both objects of an overlapping pair, but it is enough to replace
+    one of them. Objects with most overlaps are masked first, until no two unmasked objects overlap. Blamed objects that
+    overlap nothing (they fall or slide) are masked too. If these are fewer than ``at_least`` slots, random empty slots
+    are added, so that good scenes can grow. With an objective that does not judge single objects, ``at_least``
+    random slots are masked.
+
+    The number of masked slots should be small. At high noise the observed objects are noisy as well, so the masked
+    slots get their usual share of objects, regardless of the observed ones. If all empty slots are masked, inpainting
+    by clamping therefore adds too many objects and spoils the observed ones.
+
+    A scene without free objects is regenerated whole.
+    """
+
+    at_least: int = 4
+
+    def __post_init__(self) -> None:
+        check_count("culprits", "at_least", self.at_least)
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated; ``rng`` breaks ties and draws slots."""
+        free, empty = scene.is_free[0], scene.is_empty[0]
+        if not bool(free.any()):
+            return empty.clone()
+        bad = bad_objects(scene, score)
+        mask = torch.zeros_like(empty)
+        if bad is None:
+            return _some(free | empty, self.at_least, rng)
+        mask[_culprits(scene, bad, rng)] = True
+        for more in (empty, free):
+            mask |= _some(more & ~mask, self.at_least - int(mask.sum()), rng)
+        return mask
+
+
+@dataclass(frozen=True)
+class BalancedMask:
+    """The culprits of :class:`CulpritsMask`, and random slots until the shares of objects and of empty slots are equal.
+
+    Such a mask does not depend on the content of slots, like the masks of training, so the number of objects stays the
+    same. A mask of all empty slots depends on the content, and the prior then adds too many objects. The share grows
+    until ``at_least`` slots are masked, if the scene has as many.
+    """
+
+    at_least: int = 4
+
+    def __post_init__(self) -> None:
+        check_count("balanced", "at_least", self.at_least)
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        free, empty = scene.is_free[0], scene.is_empty[0]
+        mask = CulpritsMask(at_least=0)(scene, score, rng)
+        slots, objects = int((free | empty).sum()), int(free.sum())
+        share = max(int((mask & free).sum()) / max(objects, 1), min(1.0, self.at_least / max(slots, 1)))
+        for kind in (free, empty):
+            mask |= _some(kind & ~mask, round(share * int(kind.sum())) - int((mask & kind).sum()), rng)
+        return mask
+
+
+def _culprits(scene: SceneBatch, bad: Tensor, rng: np.random.Generator) -> list[int]:
+    """Slots of blamed objects (``bad``, (N,) bool), without those that are feasible once others are removed."""
+    blamed = torch.nonzero(bad).flatten().tolist()
+    if not blamed:
+        return []
+    pairs = _overlaps(scene)
+    overlapping = {slot for pair in pairs for slot in pair}
+    welded = set(torch.nonzero(scene.is_welded[0]).flatten().tolist())
+    return cover(pairs, welded, rng) + [slot for slot in blamed if slot not in overlapping]
+
+
+def cover(pairs: Sequence[tuple[int, int]], fixed: Collection[int], rng: np.random.Generator) -> list[int]:
+    """Few slots, none of them ``fixed``, that touch every pair: greedy vertex cover, ties broken by ``rng``.
+
+    >>> cover([(1, 2), (2, 3), (2, 4)], (), np.random.default_rng(0))
+    [2]
+    >>> cover([(0, 1), (0, 2)], {0}, np.random.default_rng(0))
+    [1, 2]
+    """
+    chosen = {slot for pair in pairs for slot in pair if slot not in fixed and not set(pair).isdisjoint(fixed)}
+    left = [pair for pair in pairs if chosen.isdisjoint(pair)]
+    while left:
+        slots, counts = np.unique(left, return_counts=True)
+        slot = int(rng.choice(slots[counts == counts.max()]))
+        chosen.add(slot)
+        left = [pair for pair in left if slot not in pair]
+    return sorted(chosen)
+
+
+def _overlaps(scene: SceneBatch) -> list[tuple[int, int]]:
+    """Pairs of slots that overlap deeper than feasibility allows."""
+    from scene_envs.physics import penetration  # loads the physics libraries, which other masks do not need
+
+    return [pair.slots for pair in penetration(scene).pairs[0] if pair.depth > MAX_PENETRATION]
+
+
+def _some(candidates: Tensor, count: int, rng: np.random.Generator) -> Tensor:
+    """(N,) bool: ``count`` of the candidates (N,) at random, or as many as there are."""
+    slots = torch.nonzero(candidates).flatten().tolist()
+    mask = torch.zeros_like(candidates)
+    mask[rng.permutation(slots)[: max(0, count)].astype(int).tolist()] = True
+    return mask
+
 
 MaskGenerator = Callable[[SceneBatch, Score, np.random.Generator], Tensor]
 """``(scene, score, rng) -> (N,) bool``, True where a slot is regenerated.

@@ -2,13 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-from scene_envs.lazy import lazy_names
+from scene_envs.registry import lazy_names
 
 if TYPE_CHECKING:
-    from scene_envs.export.api import ExportReport, export
-    from scene_envs.export.asset_files import AssetFiles
-    from scene_envs.export.formats import ExportFormat, list_formats, register_format
-    from scene_envs.export.placed import PlacedObject, PlacedScene, place
+    from scene_envs.export.api import ExportFormat, ExportReport, export, list_formats, register_format
+    from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, place
 
 __all__ = [
     "AssetFiles",

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
+from trimesh.exchange.gltf import export_glb
 
-from scene_envs.export.asset_files import AssetFiles
-from scene_envs.export.placed import PlacedScene
+from scene_envs.export.placed import AssetFiles, PlacedScene
 
 
 def scene_arrays(scene: PlacedScene) -> dict[str, Any]:
@@ -44,4 +45,21 @@ def write_pickle(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene.pkl``: the same arrays as a dictionary; only numpy is needed to load it."""
     path = folder / "scene.pkl"
     path.write_bytes(pickle.dumps(scene_arrays(scene), protocol=4))
+    return path
+
+
+Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""World frame (z up) to the frame of glTF (y up)."""
+
+
+def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
+    """``scene.glb``: a node per object under a node ``z_up``, which turns the world frame to that of glTF."""
+    graph = trimesh.Scene(base_frame="world")
+    graph.graph.update("z_up", "world", matrix=Y_UP)
+    for asset in scene.assets:
+        graph.geometry[files.name(asset)] = files.textured(asset)
+    for item in scene.objects:
+        graph.graph.update(item.name, "z_up", matrix=item.matrix, geometry=files.name(item.asset))
+    path = folder / "scene.glb"
+    path.write_bytes(export_glb(graph, include_normals=True))
     return path

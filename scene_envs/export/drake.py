@@ -9,8 +9,7 @@ from typing import Any
 import yaml
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.export.asset_files import AssetFiles
-from scene_envs.export.placed import PlacedObject, PlacedScene, angle_axis, number
+from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, angle_axis, number
 from scene_envs.export.urdf import asset_urdf, relative
 from scene_envs.files import write_text
 

@@ -8,10 +8,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from scene_envs.assets.base import Asset
-from scene_envs.export.asset_files import AssetFiles
-from scene_envs.export.placed import PlacedObject, PlacedScene, number, numbers, quaternion
+from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, number, numbers, quaternion
 from scene_envs.export.urdf import relative, write_xml
-from scene_envs.physics.rigid import principal_inertia
+from scene_envs.physics.parts import principal_inertia
 from scene_envs.scene_types import Camera
 
 TIMESTEP = 0.002

@@ -7,8 +7,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from scene_envs.export.asset_files import AssetFiles
-from scene_envs.export.placed import PlacedObject, PlacedScene, number, numbers
+from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, number, numbers
 from scene_envs.export.urdf import DRAKE, drake_contact, relative, write_xml
 
 

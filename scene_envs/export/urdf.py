@@ -9,8 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from scene_envs.assets.base import Asset
-from scene_envs.export.asset_files import AssetFiles
-from scene_envs.export.placed import PlacedScene, number, numbers
+from scene_envs.export.placed import AssetFiles, PlacedScene, number, numbers
 
 BULLET_MARGIN = 1e-3
 """Bullet grows each convex mesh by this much (m); the parts of its URDF are smaller by as much."""

@@ -9,11 +9,9 @@ import numpy as np
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import Asset
-from scene_envs.export.asset_files import AssetFiles, face_colors, visual_mesh
-from scene_envs.export.placed import PlacedScene, quaternion
+from scene_envs.export.placed import AssetFiles, PlacedScene, face_colors, quaternion, visual_mesh
 from scene_envs.export.urdf import relative
-from scene_envs.physics.constants import GRAVITY
-from scene_envs.physics.rigid import principal_inertia
+from scene_envs.physics.parts import GRAVITY, principal_inertia
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:

@@ -1,8 +1,5 @@
 """Scene grammars: distributions over structures and exact poses, one short file per scene type."""
 
-from scene_envs.grammars.catalogue import get_grammar, list_grammars
-from scene_envs.grammars.containers import Heap, Standing
-from scene_envs.grammars.distributions import Gaussian, Line, Moved, Uniform, Yaw
 from scene_envs.grammars.dsl import (
     NOTHING,
     Cluster,
@@ -15,10 +12,20 @@ from scene_envs.grammars.dsl import (
     Stack,
     Tiers,
 )
-from scene_envs.grammars.grammar import Grammar, register_grammar
-from scene_envs.grammars.plan import Disc, Rectangle
-from scene_envs.grammars.surface import FreeSurface, Outline, Region
-from scene_envs.grammars.towers import Filling, Node, Surface, Tower
+from scene_envs.grammars.grammar import Grammar, get_grammar, list_grammars, register_grammar
+from scene_envs.grammars.layout import Filling, Heap, Node, Standing, Surface, Tower
+from scene_envs.grammars.surface import (
+    Disc,
+    FreeSurface,
+    Gaussian,
+    Line,
+    Moved,
+    Outline,
+    Rectangle,
+    Region,
+    Uniform,
+    Yaw,
+)
 
 __all__ = [
     "NOTHING",

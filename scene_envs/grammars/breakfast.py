@@ -7,12 +7,23 @@ from __future__ import annotations
 
 import math
 
-from scene_envs.grammars.containers import Heap, Standing
-from scene_envs.grammars.distributions import Gaussian, PositionDistribution, Uniform, Yaw
-from scene_envs.grammars.dsl import NOTHING, Cluster, Geometric, Group, Object, OneOf, Repeat
-from scene_envs.grammars.parts import maybe, middle, toast
-from scene_envs.grammars.surface import Region
-from scene_envs.grammars.towers import Node
+from scene_envs.grammars.dsl import (
+    NOTHING,
+    Cluster,
+    Geometric,
+    Group,
+    Object,
+    OneOf,
+    Repeat,
+    at_least,
+    maybe,
+    middle,
+    toast,
+)
+from scene_envs.grammars.grammar import Grammar, register_grammar
+from scene_envs.grammars.layout import Heap, Node, Standing, Surface
+from scene_envs.grammars.surface import Gaussian, PositionDistribution, Region, Uniform, Yaw
+from scene_envs.scene_types import get_scene_type
 
 HALF_DEPTH, HALF_LENGTH = 0.2575, 0.65
 """Largest distances (m) in x and y of object frames from the middle of the table."""
@@ -110,3 +121,47 @@ def crock(present: float) -> Node:
     utensil = OneOf(*((1.0, Object(name)) for name in ("fork", "knife", "dinner_spoon", "teaspoon")))
     cutlery = Standing(Repeat(utensil, Geometric(0.1, 0, 10)), CROCK_RADIUS)
     return maybe(present, Object("utensil_crock", anywhere(), inside=cutlery))
+
+
+def six_places(plate: float, bowl: float, nothing: float) -> Node:
+    """Three pairs of places that face each other: near both ends and in the middle of the long sides."""
+    pair = facing_pair(place_setting(plate, bowl, nothing, another_toast=0.25))
+    ends_and_middle = (Uniform(0.0, 0.065, y=-0.40), Uniform(0.0, 0.04), Uniform(0.0, 0.065, y=0.40))
+    return Group(*(Cluster(pair, where) for where in ends_and_middle))
+
+
+def shared_for_six(fullness: float) -> Node:
+    return Group(shared_plates(1 - fullness, 4, 0.25), shared_bowls(1 - fullness, 6), cereal(0.4), jugs(0.6))
+
+
+USUAL_FOR_SIX = Group(six_places(0.535, 0.19, 0.275), shared_for_six(0.3))
+QUIET_FOR_SIX = Group(six_places(0.10, 0.05, 0.85), shared_for_six(0.3))
+FEAST_FOR_SIX = Group(six_places(0.95, 0.05, 0.00), shared_for_six(0.7))
+
+
+@register_grammar("breakfast_table_high_clutter")
+def breakfast_table_high_clutter() -> Grammar:
+    """The whole table."""
+    table = Surface([OneOf((0.90, USUAL_FOR_SIX), (0.03, QUIET_FOR_SIX), (0.07, FEAST_FOR_SIX))], TABLE)
+    return Grammar("breakfast_table_high_clutter", get_scene_type("breakfast_table_high_clutter"), [table], at_least(3))
+
+
+def two_places(plate: float, bowl: float, nothing: float) -> Node:
+    """Two places on the long sides, opposite each other, anywhere along the table."""
+    pair = facing_pair(place_setting(plate, bowl, nothing, another_toast=0.2))
+    return Cluster(pair, Gaussian(0.0, 0.0, along=0.0, across=0.2))
+
+
+def shared_for_two(crock_present: float) -> Node:
+    return Group(crock(crock_present), shared_plates(0.7, 2, 0.2), shared_bowls(0.7, 2), cereal(0.58), jugs(0.6))
+
+
+USUAL_FOR_TWO = Group(two_places(0.36, 0.12, 0.52), shared_for_two(0.12))
+FEAST_FOR_TWO = Group(two_places(0.90, 0.10, 0.00), shared_for_two(0.90))
+
+
+@register_grammar("breakfast_table_low_clutter")
+def breakfast_table_low_clutter() -> Grammar:
+    """The whole table."""
+    table = Surface([OneOf((0.98, USUAL_FOR_TWO), (0.02, FEAST_FOR_TWO))], TABLE)
+    return Grammar("breakfast_table_low_clutter", get_scene_type("breakfast_table_low_clutter"), [table], at_least(3))

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 
-from scene_envs.grammars.distributions import Gaussian
 from scene_envs.grammars.dsl import NOTHING, Geometric, Group, Object, OneOf, Repeat, Stack
 from scene_envs.grammars.grammar import Grammar, register_grammar
-from scene_envs.grammars.surface import Region
-from scene_envs.grammars.towers import Node, Surface
+from scene_envs.grammars.layout import Node, Surface
+from scene_envs.grammars.surface import Gaussian, Region
 from scene_envs.scene_types import get_scene_type
 
 KEEP_OUT = {"dinner_plate": 0.14, "teacup": 0.07, "teapot": 0.10, "serving_dish": 0.20, "steamer_bottom": 0.12}

@@ -2,7 +2,7 @@
 
 A *tower* stands on a support. It is one object, or a stack of objects on the same vertical axis, with the objects on it
 and in it. Nodes determine which objects there are (the structure). A distribution such as
-:class:`~scene_envs.grammars.distributions.Gaussian` determines where they are.
+:class:`~scene_envs.grammars.surface.Gaussian` determines where they are.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from itertools import accumulate
 import numpy as np
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.grammars.distributions import Gaussian, PositionDistribution, Yaw
-from scene_envs.grammars.towers import Filling, Node, Surface, Tower
+from scene_envs.grammars.layout import Filling, Node, Surface, Tower
+from scene_envs.grammars.surface import Gaussian, PositionDistribution, Region, Yaw
 
 _CENTER = Gaussian(along=0.0)
 
@@ -262,3 +262,27 @@ class Repeat:
 def _require_weights(word: str, weights: Collection[float]) -> None:
     if not all(weight >= 0 for weight in weights) or not sum(weights) > 0:
         raise InvalidInputError(f"{word} needs weights >= 0 with a positive sum, got {list(weights)}")
+
+
+def maybe(chance: float, node: Node) -> Node:
+    """A node with some chance, else nothing."""
+    return OneOf((chance, node), (1.0 - chance, NOTHING))
+
+
+def middle(child: Node) -> list[Surface]:
+    """Something in the middle of a plate or on the floor of a bowl."""
+    return [Surface([child], Region(0.01, 0.01), height=None)]
+
+
+def toast(another: float) -> Node:
+    """A slice of bread, with more on top by chance."""
+    return Stack("bread_slice", {"bread_slice": another, None: 1.0 - another})
+
+
+def at_least(objects: int) -> dict[str, Callable[[Sequence[Tower]], bool]]:
+    """The condition that a scene has at least ``objects`` objects besides the fixed ones."""
+
+    def enough(towers: Sequence[Tower]) -> bool:
+        return sum(len(tower.assets) + len(tower.contents) for tower in towers) >= objects
+
+    return {f"fewer than {objects} objects": enough}

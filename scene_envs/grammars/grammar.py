@@ -12,13 +12,11 @@ import torch
 from numpy.typing import NDArray
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.grammars.layout import Frame, Layout, Pose
-from scene_envs.grammars.towers import Surface, Tower
+from scene_envs.grammars.layout import Frame, Layout, Pose, Surface, Tower
 from scene_envs.registry import Registry
 from scene_envs.scene import POSE, POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
-from scene_envs.scene_types.built_in import BUILT_IN
-from scene_envs.scene_types.registry import PLUGINS
+from scene_envs.scene_types.registry import BUILT_IN, PLUGINS
 
 _MAX_STRUCTURES = 10_000
 """Number of structures drawn for one scene before an error that the grammar is impossible."""
@@ -124,8 +122,19 @@ class Grammar:
             scene[slot, POSE_FEATURES + self._category[pose.asset]] = 1.0
 
 
+_FILES = {
+    "breakfast_table_low_clutter": "breakfast",
+    "breakfast_table_high_clutter": "breakfast",
+    "living_room_shelf": "shelf",
+    "pantry_shelf": "shelf",
+    "restaurant_low_clutter": "restaurant",
+    "restaurant_high_clutter": "restaurant",
+}
+"""Files of grammars that are not called like their scene type."""
 GRAMMARS: Registry[Callable[[], Grammar]] = Registry(
-    "grammar", PLUGINS, modules={built_in.name: f"scene_envs.grammars.{built_in.name}" for built_in in BUILT_IN}
+    "grammar",
+    PLUGINS,
+    modules={built_in.name: f"scene_envs.grammars.{_FILES.get(built_in.name, built_in.name)}" for built_in in BUILT_IN},
 )
 """Functions that make a grammar each, by name."""
 
@@ -133,3 +142,20 @@ GRAMMARS: Registry[Callable[[], Grammar]] = Registry(
 def register_grammar(name: str) -> Callable[[Callable[[], Grammar]], Callable[[], Grammar]]:
     """Decorator: make the function's grammar available as ``name``; the same name again replaces it."""
     return GRAMMARS.adding(name)
+
+
+def get_grammar(scene_type: str | SceneType | Grammar) -> Grammar:
+    """A fresh grammar by its name (built-in grammars are called like their scene type)."""
+    if isinstance(scene_type, Grammar):
+        return scene_type
+    return grammar_factory(scene_type.name if isinstance(scene_type, SceneType) else scene_type)()
+
+
+def grammar_factory(name: str) -> Callable[[], Grammar]:
+    """The function registered as ``name``; raises UnknownNameError with the nearest known name."""
+    return GRAMMARS[name]
+
+
+def list_grammars() -> list[str]:
+    """Names of all registered grammars, those of installed packages included, sorted."""
+    return GRAMMARS.names()

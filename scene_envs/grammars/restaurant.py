@@ -9,12 +9,12 @@ import math
 from collections.abc import Mapping, Sequence
 
 from scene_envs.grammars import dimsum_table as dimsum
-from scene_envs.grammars.distributions import Gaussian, Line, Uniform, Yaw
-from scene_envs.grammars.dsl import Cluster, Geometric, Group, Object, OneOf, Repeat, Stack
-from scene_envs.grammars.living_room_shelf import inner_tier, top_tier
-from scene_envs.grammars.shelf import tiers
-from scene_envs.grammars.surface import Region
-from scene_envs.grammars.towers import Node, Surface, Tower
+from scene_envs.grammars.dsl import Cluster, Geometric, Group, Object, OneOf, Repeat, Stack, at_least
+from scene_envs.grammars.grammar import Grammar, register_grammar
+from scene_envs.grammars.layout import Node, Surface, Tower
+from scene_envs.grammars.shelf import inner_tier, tiers, top_tier
+from scene_envs.grammars.surface import Gaussian, Line, Region, Uniform, Yaw
+from scene_envs.scene_types import get_scene_type
 
 FLOOR = -0.785
 """z of the floor (m); table tops are at 0."""
@@ -87,3 +87,45 @@ def shelves(count: Geometric) -> Node:
 def floor(*children: Node) -> Surface:
     """The floor with ``children`` on it, placed in this order."""
     return Surface(children, ROOM, keep_out=KEEP_OUT, height=FLOOR, layouts=30)
+
+
+USUAL_HIGH = tables(
+    {3: 0.89, 4: 0.11},
+    laid(Geometric(0.2, 2, 4), another=0.3, lid=0.4, nothing=0.3, setting=0.40, empty=0.50),
+)
+QUIET_HIGH = tables(
+    {3: 1.0},
+    laid(Geometric(0.6, 2, 4), another=0.15, lid=0.4, nothing=0.45, setting=0.1, empty=0.8, dishes=0.3, teapots=0.6),
+)
+FEAST_HIGH = tables(
+    {3: 0.6, 4: 0.4},
+    laid(Geometric(0.2, 3, 4), another=0.6, lid=0.3, nothing=0.1, setting=0.8, empty=0.1),
+)
+
+
+@register_grammar("restaurant_high_clutter")
+def restaurant_high_clutter() -> Grammar:
+    """The whole room."""
+    room = floor(OneOf((0.91, USUAL_HIGH), (0.05, QUIET_HIGH), (0.04, FEAST_HIGH)), shelves(Geometric(0.2, 0, 5)))
+    return Grammar("restaurant_high_clutter", get_scene_type("restaurant_high_clutter"), [room], at_least(32))
+
+
+USUAL_LOW = tables(
+    {1: 0.44, 2: 0.39, 3: 0.13, 4: 0.04},
+    laid(Geometric(0.4, 1, 4), another=0.3, lid=0.4, nothing=0.3, setting=0.52, empty=0.38),
+)
+QUIET_LOW = tables(
+    {1: 1.0},
+    laid(Geometric(0.9, 1, 4), another=0.15, lid=0.4, nothing=0.45, setting=0.1, empty=0.8, dishes=0.2, teapots=0.5),
+)
+FEAST_LOW = tables(
+    {2: 0.3, 3: 0.3, 4: 0.4},
+    laid(Geometric(0.2, 3, 4), another=0.6, lid=0.3, nothing=0.1, setting=0.8, empty=0.1),
+)
+
+
+@register_grammar("restaurant_low_clutter")
+def restaurant_low_clutter() -> Grammar:
+    """The whole room."""
+    room = floor(OneOf((0.95, USUAL_LOW), (0.03, QUIET_LOW), (0.02, FEAST_LOW)), shelves(Geometric(0.25, 0, 3)))
+    return Grammar("restaurant_low_clutter", get_scene_type("restaurant_low_clutter"), [room])

@@ -6,12 +6,320 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.grammars.distributions import PositionDistribution, Yaw
-from scene_envs.grammars.plan import Disc, Placed, Plan, inscribed, meet
+from scene_envs.assets.base import Asset
+
+
+class PositionDistribution(Protocol):
+    """A distribution over places (x, y) in the frame of a support, m."""
+
+    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
+        """One place."""
+
+    def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(P,) log density up to a constant, at ``points`` (P, 2); None for a distribution on a line or point."""
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """A normal distribution of positions in the plane of a support.
+
+    Attributes:
+        x, y: Mean in the support's frame, m.
+        along: Standard deviation (m) along ``direction``.
+        across: Standard deviation (m) across it; None means that of ``along``.
+        direction: Angle of the first axis from +x, rad.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    along: float = 0.1
+    across: float | None = None
+    direction: float = 0.0
+
+    @cached_property
+    def _axes(self) -> tuple[float, float, float, float]:
+        across = self.along if self.across is None else self.across
+        return math.cos(self.direction), math.sin(self.direction), self.along, across
+
+    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
+        """One position (x, y), m."""
+        cos, sin, along, across = self._axes
+        u, v = along * rng.standard_normal(), across * rng.standard_normal()
+        return self.x + cos * u - sin * v, self.y + sin * u + cos * v
+
+    def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(P,) log density up to a constant, at ``points`` (P, 2); None for a point or a line."""
+        cos, sin, along, across = self._axes
+        if along == 0.0 or across == 0.0:
+            return None
+        dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
+        return -0.5 * (((cos * dx + sin * dy) / along) ** 2 + ((cos * dy - sin * dx) / across) ** 2)
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Anywhere in a rectangle of the support: ``half_x``, ``half_y`` (m) about (``x``, ``y``)."""
+
+    half_x: float
+    half_y: float
+    x: float = 0.0
+    y: float = 0.0
+
+    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
+        """One position (x, y), m."""
+        return (
+            self.x + self.half_x * (2.0 * rng.random() - 1.0),
+            self.y + self.half_y * (2.0 * rng.random() - 1.0),
+        )
+
+    def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P,) 0 inside, minus infinity outside."""
+        inside = (np.abs(points[:, 0] - self.x) <= self.half_x) & (np.abs(points[:, 1] - self.y) <= self.half_y)
+        return np.where(inside, 0.0, -np.inf)
+
+
+@dataclass(frozen=True)
+class Line:
+    """Anywhere on the segment between two points (x, y), m: along a wall, at the edge of a shelf."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
+        """One position (x, y), m."""
+        t = rng.random()
+        return (
+            self.start[0] + t * (self.end[0] - self.start[0]),
+            self.start[1] + t * (self.end[1] - self.start[1]),
+        )
+
+    def log_density(self, points: NDArray[np.float64]) -> None:
+        """None: a line has no density in the plane."""
+        return None
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A distribution in its own frame at (``x``, ``y``) m, turned by ``yaw`` rad."""
+
+    distribution: PositionDistribution
+    x: float
+    y: float
+    yaw: float
+
+    def draw(self, rng: np.random.Generator) -> tuple[float, float]:
+        """One position (x, y), m."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        x, y = self.distribution.draw(rng)
+        return self.x + cos * x - sin * y, self.y + sin * x + cos * y
+
+    def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(P,) log density up to a constant, at ``points`` (P, 2)."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
+        return self.distribution.log_density(np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=1))
+
+
+@dataclass(frozen=True)
+class Yaw:
+    """Turn of a child about the vertical: one of ``choices`` plus a normal deviate.
+
+    Attributes:
+        std: Standard deviation, rad; infinite for any angle.
+        choices: Angles (rad) of the object's +x axis from the support's, equally likely.
+    """
+
+    std: float = math.inf
+    choices: tuple[float, ...] = (0.0,)
+
+    def draw(self, rng: np.random.Generator) -> float:
+        """One angle, rad."""
+        if self.std == math.inf:
+            return rng.random() * 2.0 * math.pi
+        center = self.choices[0] if len(self.choices) == 1 else self.choices[int(rng.integers(len(self.choices)))]
+        return center + self.std * rng.standard_normal()
+
+    def turned(self, angle: float) -> Yaw:
+        """The same distribution in a frame that is turned by ``angle``, rad."""
+        return self if self.std == math.inf else Yaw(self.std, tuple(choice + angle for choice in self.choices))
+
+
+CLEARANCE = 5e-4
+"""Margin (m) by which the plan of an asset is larger than the asset, so that neighbours never touch."""
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A circle about the frame of an object; ``radius`` in m."""
+
+    radius: float
+
+    @property
+    def reach(self) -> float:
+        """Largest distance (m) of the plan from the frame."""
+        return self.radius
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """An axis-aligned rectangle in the frame of an object.
+
+    Attributes:
+        half_x, half_y: Half sides, m.
+        center_x, center_y: Centre in the object frame, m.
+    """
+
+    half_x: float
+    half_y: float
+    center_x: float = 0.0
+    center_y: float = 0.0
+
+    @cached_property
+    def reach(self) -> float:
+        """Largest distance (m) of the plan from the frame."""
+        return math.hypot(abs(self.center_x) + self.half_x, abs(self.center_y) + self.half_y)
+
+
+Plan = Disc | Rectangle
+
+
+def inscribed(plan: Plan) -> float:
+    """Radius (m) of the largest disc about the frame that lies within the plan; 0 when the frame is outside."""
+    if isinstance(plan, Disc):
+        return plan.radius
+    return max(0.0, min(plan.half_x - abs(plan.center_x), plan.half_y - abs(plan.center_y)))
+
+
+class Placed(NamedTuple):
+    """A plan at a place: frame (x, y) in m, cosine and sine of its yaw."""
+
+    plan: Plan
+    x: float
+    y: float
+    cos: float
+    sin: float
+
+    def corners(self) -> list[tuple[float, float]]:
+        """The four corners of a rectangle, counter-clockwise, m."""
+        plan = self.plan
+        if isinstance(plan, Disc):
+            raise TypeError("a disc has no corners")
+        x, y = self.center()
+        ux, uy = self.cos * plan.half_x, self.sin * plan.half_x
+        vx, vy = -self.sin * plan.half_y, self.cos * plan.half_y
+        return [(x + ux + vx, y + uy + vy), (x - ux + vx, y - uy + vy), (x - ux - vx, y - uy - vy),
+                (x + ux - vx, y + uy - vy)]  # fmt: skip
+
+    def center(self) -> tuple[float, float]:
+        """Centre of the plan, m."""
+        if isinstance(self.plan, Disc):
+            return self.x, self.y
+        a, b = self.plan.center_x, self.plan.center_y
+        return self.x + self.cos * a - self.sin * b, self.y + self.sin * a + self.cos * b
+
+
+def meet(first: Placed, second: Placed) -> bool:
+    """Whether two plans overlap.
+
+    >>> square = Rectangle(0.1, 0.1)
+    >>> meet(Placed(square, 0.0, 0.0, 1.0, 0.0), Placed(Disc(0.05), 0.16, 0.0, 1.0, 0.0))
+    False
+    >>> meet(Placed(square, 0.0, 0.0, 1.0, 0.0), Placed(Disc(0.05), 0.13, 0.13, 1.0, 0.0))
+    True
+    """
+    dx, dy = second.x - first.x, second.y - first.y
+    reach = first.plan.reach + second.plan.reach
+    if dx * dx + dy * dy >= reach * reach:
+        return False
+    if isinstance(first.plan, Disc):
+        if isinstance(second.plan, Disc):
+            return True
+        return _disc_meets(second, first.x, first.y, first.plan.radius)
+    if isinstance(second.plan, Disc):
+        return _disc_meets(first, second.x, second.y, second.plan.radius)
+    return not (_apart(first, second) or _apart(second, first))
+
+
+def _disc_meets(box: Placed, x: float, y: float, radius: float) -> bool:
+    plan = box.plan
+    assert isinstance(plan, Rectangle)
+    center_x, center_y = box.center()
+    dx, dy = x - center_x, y - center_y
+    along = max(0.0, abs(box.cos * dx + box.sin * dy) - plan.half_x)
+    across = max(0.0, abs(box.cos * dy - box.sin * dx) - plan.half_y)
+    return along * along + across * across < radius * radius
+
+
+def _apart(box: Placed, other: Placed) -> bool:
+    """Whether a side of ``box`` separates the two rectangles."""
+    plan = box.plan
+    assert isinstance(plan, Rectangle)
+    center_x, center_y = box.center()
+    along, across = [], []
+    for x, y in other.corners():
+        dx, dy = x - center_x, y - center_y
+        along.append(box.cos * dx + box.sin * dy)
+        across.append(box.cos * dy - box.sin * dx)
+    return (
+        min(along) >= plan.half_x
+        or max(along) <= -plan.half_x
+        or min(across) >= plan.half_y
+        or max(across) <= -plan.half_y
+    )
+
+
+def plan_of(asset: Asset) -> Plan:
+    """The smaller of the disc about the frame and the axis-aligned rectangle that hold ``asset``, with a margin."""
+    corners = np.concatenate([part.vertices for part in asset.fine])
+    radius = float(np.hypot(corners[:, 0], corners[:, 1]).max()) + CLEARANCE
+    low, high = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
+    half = 0.5 * (high - low) + CLEARANCE
+    if math.pi * radius**2 < 4.0 * half[0] * half[1]:
+        return Disc(radius)
+    center = 0.5 * (low + high)
+    return Rectangle(*(float(v) for v in (*half, *np.round(center, 9))))
+
+
+def foot_of(asset: Asset) -> float:
+    """z of the lowest point of ``asset`` in its frame, m."""
+    return _tidy(asset.bounds[0, 2])
+
+
+def top_of(asset: Asset) -> float:
+    """z of the highest point of ``asset`` in its frame, m."""
+    return _tidy(asset.bounds[1, 2])
+
+
+def carrying_height(asset: Asset) -> float:
+    """z (m, asset frame) at which something in the middle of ``asset`` rests: a plate's base, the floor of a bowl."""
+    heights = [top for part in asset.fine if (top := _top_on_axis(part.vertices[part.faces])) is not None]
+    return _tidy(max(heights)) if heights else top_of(asset)
+
+
+def _top_on_axis(triangles: NDArray[np.float64]) -> float | None:
+    """Highest z at which a convex part (F, 3, 3) crosses the line x = y = 0; None when it does not."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    offsets = np.einsum("fi,fi->f", normals, triangles[:, 0])
+    slope = normals[:, 2]
+    scale = np.abs(normals).max()
+    level = np.abs(slope) <= 1e-9 * scale
+    if (offsets[level] < -_ROUNDING * scale).any():
+        return None
+    high = (offsets[slope > 1e-9 * scale] / slope[slope > 1e-9 * scale]).min()
+    low = (offsets[slope < -1e-9 * scale] / slope[slope < -1e-9 * scale]).max()
+    return float(high) if high >= low - _ROUNDING else None
+
+
+def _tidy(value: float) -> float:
+    """A length rounded to nine decimals, to remove rounding errors."""
+    return float(np.round(value, 9)) + 0.0
+
 
 _DRAWS = 24
 """Draws from a child's own distribution before the free region is enumerated."""
@@ -114,7 +422,7 @@ class Outline:
 class FreeSurface:
     """A flat support while it is being filled.
 
-    >>> from scene_envs.grammars.distributions import Gaussian
+    >>> from scene_envs.grammars.surface import Gaussian
     >>> surface = FreeSurface(Region(0.5, 0.5))
     >>> rng = np.random.default_rng(0)
     >>> cup = Outline((Disc(0.1),), (Disc(0.1),))

@@ -7,10 +7,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from scene_envs.lazy import lazy_names
+from scene_envs.registry import lazy_names
 
 if TYPE_CHECKING:
     from scene_envs.physics.api import (
+        EquilibriumResult,
+        FeasibilityResult,
+        ObjectPair,
+        PenetrationResult,
+        ProjectionResult,
+        ReadyResult,
+        SettleResult,
         equilibrium,
         feasibility,
         furniture_overlap,
@@ -20,15 +27,6 @@ if TYPE_CHECKING:
     )
     from scene_envs.physics.pool import PhysicsPool, RayPhysicsPool, make_pool
     from scene_envs.physics.readiness import make_ready
-    from scene_envs.physics.results import (
-        EquilibriumResult,
-        FeasibilityResult,
-        ObjectPair,
-        PenetrationResult,
-        ProjectionResult,
-        ReadyResult,
-        SettleResult,
-    )
 
 __all__ = [
     "EquilibriumResult",

@@ -2,24 +2,244 @@
 
 from __future__ import annotations
 
+import logging
 import math
+from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics.batches import poses_after, run_kernel, stack, valid_rows
+from scene_envs.physics.kernels import Chunk
 from scene_envs.physics.motion import ITERATIONS
 from scene_envs.physics.pool import PhysicsPool
-from scene_envs.physics.results import (
-    EquilibriumResult,
-    FeasibilityResult,
-    ObjectPair,
-    PenetrationResult,
-    ProjectionResult,
-    SettleResult,
-)
-from scene_envs.scene import SceneBatch
+from scene_envs.rotations import geodesic_angle, project_to_so3
+from scene_envs.scene import SceneBatch, require_rigid_poses
+
+_LOGGER = logging.getLogger(__name__)
+_CHUNK = 8
+"""Scenes per message to a worker."""
+
+Rows = list[dict[str, Any] | None]
+"""Results of a kernel, one per scene."""
+
+
+def run_kernel(
+    kernel: str,
+    batch: SceneBatch,
+    options: dict[str, Any],
+    pool: PhysicsPool | None,
+    units: Tensor | None = None,
+) -> Rows:
+    """Run a kernel on a batch: the results of each scene, None where it failed twice.
+
+    Args:
+        kernel: Name of a function of :data:`scene_envs.physics.kernels.KERNELS`.
+        batch: B scenes.
+        options: Keyword arguments of the kernel.
+        pool: Worker processes; None computes in this process.
+        units: (B,) float64, units that the simulation of each scene may spend; None derives them from its objects.
+
+    Raises:
+        InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
+    """
+    require_rigid_poses(batch)
+    translations = batch.translations.double().cpu().numpy()
+    rotations = batch.rotations.double().cpu().numpy()
+    categories = batch.categories.cpu().numpy()
+    workers = max(1, pool.workers) if pool else 1
+    size = max(1, min(_CHUNK, -(-len(batch) // workers)))
+    limits = None if units is None else units.double().cpu().numpy()
+    chunks = []
+    for start in range(0, len(batch), size):
+        rows = slice(start, start + size)
+        some = None if limits is None else limits[rows]
+        chunks.append(Chunk(batch.scene_type, translations[rows], rotations[rows], categories[rows], some))
+    results = (pool or PhysicsPool(workers=0)).run(kernel, chunks, options)
+    if lost := sum(row is not None and not row["valid"] for row in results):
+        _LOGGER.debug(
+            "%s: %d of %d scenes are invalid: too deep in each other to be simulated or measured, or the simulation "
+            "diverged or took more work than a scene may, and was ended", kernel, lost, len(results),
+        )  # fmt: skip
+    return results
+
+
+def valid_rows(rows: Rows) -> Tensor:
+    """(B,) bool, scenes that were judged."""
+    return torch.tensor([row is not None and bool(row["valid"]) for row in rows], dtype=torch.bool)
+
+
+def spent(rows: Rows) -> Tensor:
+    """(B,) float64, units of simulation that each scene took; infinite if the scene failed twice."""
+    return torch.tensor([np.inf if row is None else float(row["spent"]) for row in rows], dtype=torch.float64)
+
+
+def stack(
+    rows: Rows,
+    batch: SceneBatch,
+    name: str,
+    dtype: torch.dtype = torch.float32,
+    shape: tuple[int, ...] | None = None,
+) -> Tensor:
+    """(B, N) tensor of a named result (or (B, *shape)), zeros where a row is invalid."""
+    shape = (batch.tensor.shape[1],) if shape is None else shape
+    out = torch.zeros(len(rows), *shape, dtype=dtype)
+    for index, row in enumerate(rows):
+        if row is not None and row["valid"]:
+            out[index] = torch.as_tensor(np.asarray(row[name]), dtype=dtype)
+    return out
+
+
+def poses_after(rows: Rows, batch: SceneBatch) -> tuple[SceneBatch, Tensor, Tensor]:
+    """The batch at its new poses, with displacement (B, N) m and rotation (B, N) rad of each object; all on the CPU."""
+    batch = batch.to("cpu")
+    translations, rotations = batch.translations.clone(), batch.rotations.clone()
+    for index, row in enumerate(rows):
+        if row is not None and row["valid"]:
+            translations[index] = torch.from_numpy(row["translations"]).float()
+            if "rotations" in row:
+                rotations[index] = torch.from_numpy(row["rotations"]).float()
+    present = ~batch.is_empty
+    displacement = (translations - batch.translations).norm(dim=-1) * present
+    identity = torch.eye(3).expand_as(rotations)
+    before = torch.where(present[..., None, None], batch.rotations, identity)
+    after = torch.where(present[..., None, None], project_to_so3(rotations), identity)
+    return batch.with_poses(translations, after), displacement, geodesic_angle(before, after) * present
+
+
+@dataclass(frozen=True)
+class FeasibilityResult:
+    """The verdict per object.
+
+    Attributes:
+        feasible: (B, N) bool; True for free objects that pass, False for welded and empty slots.
+        depth: (B, N) m, deepest overlap of each object with any other, welded ones included.
+        displacement: (B, N) m, motion of the object frame; 0 where the object was not simulated.
+        rotation: (B, N) rad, angle that the object turned.
+        valid: (B,) bool; False where physics could not judge the scene. All other fields are 0 there.
+        counts: (B,) int64, feasible objects per scene.
+    """
+
+    feasible: Tensor
+    depth: Tensor
+    displacement: Tensor
+    rotation: Tensor
+    valid: Tensor
+    counts: Tensor
+
+
+@dataclass(frozen=True)
+class ObjectPair:
+    """Two overlapping objects of one scene.
+
+    Attributes:
+        slots: Slots of the two objects.
+        depth: Deepest overlap of any two of their convex parts, m.
+        total: Sum of the overlaps of all pairs of their convex parts, m.
+        part_pairs: Number of overlapping pairs of convex parts.
+    """
+
+    slots: tuple[int, int]
+    depth: float
+    total: float
+    part_pairs: int
+
+
+@dataclass(frozen=True)
+class PenetrationResult:
+    """Overlap between objects; pairs of welded objects do not count.
+
+    Attributes:
+        pairs: Overlapping object pairs of each scene, in slot order.
+        depth: (B, N) m, deepest overlap of each object.
+        total_per_pair: (B,) m, the sum over object pairs of their depth.
+        total_per_geometry: (B,) m, the sum over all pairs of convex parts (the literature's measure).
+        valid: (B,) bool.
+    """
+
+    pairs: tuple[tuple[ObjectPair, ...], ...]
+    depth: Tensor
+    total_per_pair: Tensor
+    total_per_geometry: Tensor
+    valid: Tensor
+
+
+@dataclass(frozen=True)
+class EquilibriumResult:
+    """Motion under gravity.
+
+    Attributes:
+        displacement: (B, N) m.
+        rotation: (B, N) rad.
+        valid: (B,) bool.
+    """
+
+    displacement: Tensor
+    rotation: Tensor
+    valid: Tensor
+
+
+@dataclass(frozen=True)
+class SettleResult:
+    """Scenes after they came to rest.
+
+    Attributes:
+        batch: Scenes at their new poses; invalid rows are unchanged.
+        displacement: (B, N) m, distance from the given poses.
+        rotation: (B, N) rad.
+        finished: (B,) bool; False where the scene's work budget was spent first: objects are at the poses reached, and
+            may be moving. False also where ``valid`` is False.
+        valid: (B,) bool.
+    """
+
+    batch: SceneBatch
+    displacement: Tensor
+    rotation: Tensor
+    finished: Tensor
+    valid: Tensor
+
+
+@dataclass(frozen=True)
+class ProjectionResult:
+    """Scenes moved to the nearest translations without overlap.
+
+    Attributes:
+        batch: Projected scenes; rotations and welded objects are unchanged.
+        converged: (B,) bool; True where no overlap deeper than the tolerance is left.
+        residual_depth: (B,) m, deepest overlap left.
+        moved: (B, N) m, distance that each object was moved.
+        heap: (B,) bool; True where objects overlapped so deeply that they were spread to free places.
+        valid: (B,) bool.
+    """
+
+    batch: SceneBatch
+    converged: Tensor
+    residual_depth: Tensor
+    moved: Tensor
+    heap: Tensor
+    valid: Tensor
+
+
+@dataclass(frozen=True)
+class ReadyResult:
+    """Scenes made ready for a simulator.
+
+    Attributes:
+        batch: Projected and settled scenes, each of its best round.
+        ready: (B, N) bool; free objects that are simulation-ready there (see :func:`make_ready`).
+        counts: (B,) int64, ready objects per scene.
+        finished: (B,) bool; False where the scene's work budget was spent first: the batch is the best effort, and
+            objects that were not judged are not ready. False also where ``valid`` is False.
+        valid: (B,) bool; False where the first round could not judge the scene.
+    """
+
+    batch: SceneBatch
+    ready: Tensor
+    counts: Tensor
+    finished: Tensor
+    valid: Tensor
 
 
 def check_numbers(duration: float, **limits: float) -> None:
@@ -143,7 +363,7 @@ def settle(
     The simulation lasts up to ``duration`` seconds and stops earlier when nothing moves any more. Objects that fall off
     their support end outside the workspace; they are stopped once they are a metre below it. A heap is invalid: its
     objects overlap so deeply that its simulation would take too long. Project it first. The work per scene has a limit,
-    which is smaller if many objects overlap deeply (:mod:`scene_envs.physics.budget`). When the limit is reached,
+    which is smaller if many objects overlap deeply (:mod:`scene_envs.physics.placement`). When the limit is reached,
     objects stay at the poses reached, and ``finished`` is False.
 
     Args:

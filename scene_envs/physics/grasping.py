@@ -14,11 +14,9 @@ from scene_envs.arrays import Array, Index, Mask
 from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart
 from scene_envs.assets.shapes import box
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics.budget import Budget
 from scene_envs.physics.collision import Collider
-from scene_envs.physics.geometry import library_geometry
-from scene_envs.physics.placement import Objects, flatten, object_boxes, part_pairs, place
-from scene_envs.physics.separation import separations
+from scene_envs.physics.parts import library_geometry
+from scene_envs.physics.placement import Budget, Objects, flatten, object_boxes, part_pairs, place, separations
 from scene_envs.scene import SceneBatch
 
 TOUCHING = 1e-4

@@ -11,13 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.arrays import Array, Index
-from scene_envs.physics.budget import Budget, simulation_units
-from scene_envs.physics.motion import Physics, motion, physics_of
-from scene_envs.physics.pairs import ObjectPairs
-from scene_envs.physics.placement import Objects, flatten
-from scene_envs.physics.projection import TOLERANCE, project_objects
-from scene_envs.physics.settling import settle_scene
-from scene_envs.physics.spreading import heaps
+from scene_envs.physics.motion import Physics, motion, physics_of, settle_scene
+from scene_envs.physics.placement import Budget, ObjectPairs, Objects, flatten, simulation_units
+from scene_envs.physics.projection import TOLERANCE, heaps, project_objects
 from scene_envs.scene_types import SceneType
 
 _LOGGER = logging.getLogger(__name__)

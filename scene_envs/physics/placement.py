@@ -2,15 +2,141 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.geometry import LevelGeometry, LibraryGeometry
-from scene_envs.physics.rows import Rows
-from scene_envs.physics.separation import PlacedParts, rotate
+from scene_envs.physics.parts import SIZE_CLASSES, LevelGeometry, LibraryGeometry, Rows
+
+_CLASSES = len(SIZE_CLASSES) + 1
+_BLOCK = 1 << 16
+"""Face-corner combinations computed together: their arrays stay in the cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedParts:
+    """Parts of placed objects."""
+
+    part: Index  # (I,) index of the part in the library
+    rotation: Array  # (I, 3, 3), asset frame to world
+    translation: Array  # (I, 3) m, world
+
+
+def rotate(rotation: Array, points: Array) -> Array:
+    """(..., 3, 3) applied to (..., P, 3); written out, so that a row's result never depends on the others."""
+    r, p = rotation[..., None, :, :], points[..., :, None, :]
+    return r[..., 0] * p[..., 0] + r[..., 1] * p[..., 1] + r[..., 2] * p[..., 2]  # type: ignore[no-any-return]
+
+
+def separations(library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index) -> tuple[Array, Array]:
+    """Largest signed gap of each pair of ``placed`` parts, rows (P,), over all face directions of both.
+
+    Returns:
+        gap (P,) m, positive when a face plane separates the pair, and the direction (P, 3) of that plane in the world,
+        from the first part to the second. The true distance is at least ``gap``, the true depth at most ``-gap``.
+    """
+    gap = np.empty(len(first))
+    direction = np.empty((len(first), 3))
+    classes = library.size_class[placed.part]
+    groups = classes[first] * _CLASSES + classes[second]
+    for group in np.unique(groups):
+        class_a, class_b = divmod(int(group), _CLASSES)
+        rows = np.flatnonzero(groups == group)
+        step = max(1, _BLOCK // _combinations(library, class_a, class_b))
+        for start in range(0, len(rows), step):
+            some = rows[start : start + step]
+            gap[some], direction[some] = _one_group(library, placed, first[some], second[some], class_a, class_b)
+    return gap, direction
+
+
+def _combinations(library: LibraryGeometry, class_a: int, class_b: int) -> int:
+    """Faces of one part times corners of the other, both ways, for parts of two size classes."""
+    a, b = library.tables[class_a], library.tables[class_b]
+    return a.normals.shape[1] * b.vertices.shape[1] + b.normals.shape[1] * a.vertices.shape[1]
+
+
+def _one_group(
+    library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index, class_a: int, class_b: int
+) -> tuple[Array, Array]:
+    table_a, table_b = library.tables[class_a], library.tables[class_b]
+    row_a, row_b = library.row[placed.part[first]], library.row[placed.part[second]]
+    rotation_a, rotation_b = placed.rotation[first], placed.rotation[second]
+    shift = placed.translation[second] - placed.translation[first]  # (P, 3)
+    gap_a, normal_a = _face_gaps(
+        table_a.normals[row_a], table_a.offsets[row_a], rotation_a, table_b.vertices[row_b], rotation_b, shift
+    )
+    gap_b, normal_b = _face_gaps(
+        table_b.normals[row_b], table_b.offsets[row_b], rotation_b, table_a.vertices[row_a], rotation_a, -shift
+    )
+    use_a = gap_a >= gap_b
+    return np.where(use_a, gap_a, gap_b), np.where(use_a[:, None], normal_a, -normal_b)
+
+
+def grouped_gaps(
+    library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index, shift: Array
+) -> Iterator[tuple[Index, Array, Array]]:
+    """Signed gaps of pairs of ``placed`` parts, rows (P,), over *all* face directions of both, in groups of equal size.
+
+    ``shift`` (P, 3) m leads from the origin of the first part's object to the origin of the second part's object.
+
+    Yields:
+        rows (Q,) of the pairs, gaps (Q, K) m, and directions (Q, K, 3) in the world, from first to second.
+    """
+    classes = library.size_class[placed.part]
+    groups = classes[first] * _CLASSES + classes[second]
+    for group in np.unique(groups):
+        rows = np.flatnonzero(groups == group)
+        table_a, table_b = (library.tables[index] for index in divmod(int(group), _CLASSES))
+        a, b = first[rows], second[rows]
+        row_a, row_b = library.row[placed.part[a]], library.row[placed.part[b]]
+        turn_a, turn_b = placed.rotation[a], placed.rotation[b]
+        gap_a, normal_a = _all_face_gaps(
+            table_a.normals[row_a], table_a.offsets[row_a], turn_a, table_b.vertices[row_b], turn_b, shift[rows]
+        )
+        gap_b, normal_b = _all_face_gaps(
+            table_b.normals[row_b], table_b.offsets[row_b], turn_b, table_a.vertices[row_a], turn_a, -shift[rows]
+        )
+        yield rows, np.concatenate([gap_a, gap_b], axis=1), np.concatenate([normal_a, -normal_b], axis=1)
+
+
+def _face_gaps(
+    normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
+) -> tuple[Array, Array]:
+    """Best face of the owner: (P,) gap and (P, 3) world normal; ``shift`` leads to the other part."""
+    own = rotation.swapaxes(-1, -2)
+    seen = rotate(rotate(other.swapaxes(-1, -2), own).swapaxes(-1, -2), normals)  # (P, K, 3) in the other's frame
+    away = rotate(other.swapaxes(-1, -2), shift[:, None])[:, 0]
+    gaps = _lowest(seen, vertices) + _along(seen, away) - offsets
+    best = gaps.argmax(axis=1)
+    rows = np.arange(len(best))
+    return gaps[rows, best], rotate(rotation, normals[rows, best][:, None])[:, 0]
+
+
+def _all_face_gaps(
+    normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
+) -> tuple[Array, Array]:
+    """Every face of the owner: (P, K) gaps and (P, K, 3) world normals."""
+    world = rotate(rotation, normals)
+    seen = rotate(other.swapaxes(-1, -2), world)
+    return _lowest(seen, vertices) + _along(world, shift) - offsets, world
+
+
+def _lowest(directions: Array, vertices: Array) -> Array:
+    """(P, K) m: least height of vertices (P, V, 3) along directions (P, K, 3) of the same frame."""
+    height = directions[:, :, None, 0] * vertices[:, None, :, 0]
+    height += directions[:, :, None, 1] * vertices[:, None, :, 1]
+    height += directions[:, :, None, 2] * vertices[:, None, :, 2]
+    return height.min(axis=2)  # type: ignore[no-any-return]
+
+
+def _along(directions: Array, vector: Array) -> Array:
+    """(P, K) m: components of vectors (P, 3) along directions (P, K, 3)."""
+    x, y, z = vector[:, None, 0], vector[:, None, 1], vector[:, None, 2]
+    return directions[..., 0] * x + directions[..., 1] * y + directions[..., 2] * z  # type: ignore[no-any-return]
+
 
 Level = Literal["fine", "coarse"]
 
@@ -91,3 +217,108 @@ def part_pairs(placed: PlacedObjects, first: Index, second: Index) -> tuple[Inde
     within = np.arange(len(pair)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     columns = placed.count[second][pair]
     return pair, placed.start[first][pair] + within // columns, placed.start[second][pair] + within % columns
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts(Rows):
+    """Near pairs of parts."""
+
+    first: Index  # (Q,) object rows
+    second: Index  # (Q,) object rows, larger than ``first``
+    part_first: Index  # (Q,) part of the first object in the library
+    part_second: Index  # (Q,) part of the second object in the library
+    gap: Array  # (Q,) m along ``direction``; the true distance is at least this much
+    direction: Array  # (Q, 3) unit vector in the world, from the first part to the second
+
+    def among(self, number: Index) -> Contacts:
+        """The contacts of objects whose new ``number`` (n,) is not negative, renumbered."""
+        first, second = number[self.first], number[self.second]
+        return replace(self, first=first, second=second)[(first >= 0) & (second >= 0)]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectPairs:
+    """Pairs of objects whose boxes are near each other."""
+
+    first: Index  # (P,) object rows
+    second: Index  # (P,) object rows, larger than ``first``
+    gap: Array  # (P,) m, signed gap of the coarse parts along ``direction``
+    direction: Array  # (P, 3) unit vector in the world, from the first object to the second
+    depth: Array  # (P,) m, overlap of the fine parts; 0 without overlap
+    total: Array  # (P,) m, sum of the depths of all overlapping fine parts (on request)
+    part_count: Index  # (P,) overlapping fine part pairs (on request)
+    low: Array  # (n, 3) lowest corner of each object's box, m
+    high: Array  # (n, 3) highest corner of each object's box, m
+    contacts: Contacts  # near pairs of the coarse parts of these objects
+    rough: Mask  # (P,) the depth is an upper bound, from coarse parts: exact depths would take too long
+
+    def among(self, rows: Index) -> ObjectPairs:
+        """The pairs of the objects ``rows`` (m,), ascending, renumbered to 0..m-1."""
+        number = np.full(len(self.low), -1, dtype=np.int64)
+        number[rows] = np.arange(len(rows))
+        first, second = number[self.first], number[self.second]
+        kept = (first >= 0) & (second >= 0)
+        first, second, low, high = first[kept], second[kept], self.low[rows], self.high[rows]
+        gap, direction, depth, total = (column[kept] for column in (self.gap, self.direction, self.depth, self.total))
+        count, contacts, rough = self.part_count[kept], self.contacts.among(number), self.rough[kept]
+        return ObjectPairs(first, second, gap, direction, depth, total, count, low, high, contacts, rough)
+
+    def deepest(self) -> Array:
+        """(n,) m, the deepest overlap of each object."""
+        depth = np.zeros(len(self.low))
+        np.maximum.at(depth, self.first, self.depth)
+        np.maximum.at(depth, self.second, self.depth)
+        return depth
+
+
+PER_SCENE, PER_OBJECT, PER_PAIR, MAX_PER_OBJECT = 1_000.0, 1_200.0, 500.0, 10_000.0
+"""Units of simulation (see :class:`Budget`) that a scene may take: ``PER_SCENE``, plus ``PER_OBJECT`` for each free
+object, plus ``PER_PAIR`` for each pair of free objects, because they may meet. The sum of the last two is at most
+``MAX_PER_OBJECT`` for each free object."""
+MIN_UNITS = 20_000.0
+"""Smallest number of units beyond ``PER_SCENE``, unless ``MAX_PER_OBJECT`` gives fewer. It lets a scene of five
+objects go through all rounds of :func:`~scene_envs.physics.make_ready`."""
+_CROWDED = 0.75
+"""Above this share of free objects that do not stand clear of each other, a scene gets only ``PER_SCENE`` units."""
+_COINCIDENT = 0.9
+"""Two objects coincide when the common part of their boxes is at least this share of the larger box."""
+_DEEP = 1e-2
+"""A free object does not stand clear when it is deeper than this (m) in another free one, or coincides with one."""
+
+
+@dataclass
+class Budget:
+    """Units of work that a search or a simulation may spend.
+
+    A unit of a search is one tested pair of convex parts. A unit of simulation is one free object over one step of
+    35 solver iterations: about 0.05 ms, several times that where objects are deep in each other.
+    """
+
+    limit: float  # number of units at which the work ends
+    spent: float = 0.0  # number of units spent so far
+
+    def spend(self, units: float) -> None:
+        """Add ``units`` of work."""
+        self.spent += units
+
+    @property
+    def is_spent(self) -> bool:
+        """Whether the limit is reached."""
+        return self.spent >= self.limit
+
+
+def simulation_units(objects: Objects, pairs: ObjectPairs) -> float:
+    """Units of simulation that one scene, given as its objects and their near pairs, may take."""
+    first, second = pairs.first, pairs.second
+    low = np.maximum(pairs.low[first], pairs.low[second])
+    high = np.minimum(pairs.high[first], pairs.high[second])
+    volume = np.prod(pairs.high - pairs.low, axis=1)
+    common = np.prod(np.maximum(high - low, 0.0), axis=1)
+    close = (pairs.depth > _DEEP) | (common >= _COINCIDENT * np.maximum(volume[first], volume[second]))
+    close &= ~(objects.fixed[first] | objects.fixed[second])
+    crowded = np.isin(np.arange(len(objects)), np.concatenate([first[close], second[close]]))
+    free = int((~objects.fixed).sum())
+    if crowded.sum() > _CROWDED * free:
+        return PER_SCENE
+    more = PER_OBJECT * free + PER_PAIR * free * (free - 1) / 2
+    return PER_SCENE + min(max(more, MIN_UNITS), MAX_PER_OBJECT * free)

@@ -16,14 +16,535 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import nnls
+from scipy.sparse import csr_array
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.budget import Budget
-from scene_envs.physics.collision import Collider, corner_tests
-from scene_envs.physics.minimum_translation import Tried, minimum_translations
-from scene_envs.physics.placement import Objects
-from scene_envs.physics.planes import Planes, near_pairs, nearest, separating_planes
-from scene_envs.physics.spreading import heaps, spread
+from scene_envs.physics.collision import Collider, corner_tests, scene_pairs
+from scene_envs.physics.parts import LibraryGeometry, Rows
+from scene_envs.physics.placement import Budget, Objects, grouped_gaps, object_boxes, part_pairs, place
+from scene_envs.physics.statics import components
+
+CLEARANCE = 2e-5
+"""Gap (m) that planes ask for, so that rounding does not leave an overlap."""
+_REACH = 0.02
+"""Objects nearer than this (m) are kept apart although they do not overlap."""
+_SLACK = 300.0
+"""Cost of a metre of overlap relative to a metre of distance, squared in the objective."""
+_MET = 1e-7
+"""A plane broken by less than this (m) is met."""
+_APART = 1e-6
+"""Parts count as apart when the gap at their best face plane is at least minus this (m)."""
+_EXACT = 200
+"""Planes up to which the least-distance problem is solved exactly."""
+_MAX_SOLVER_STEPS = 400
+"""Steps of the first-order method that solves larger problems."""
+_ITERATIONS = 1e8
+"""Matrix entries that the exact method may visit."""
+_ROWS_SQUARED = 25.0
+"""A least-distance problem costs the square of its number of rows, divided by this, in units of work."""
+
+
+@dataclass(frozen=True, eq=False)
+class Planes(Rows):
+    """Half-spaces: ``direction . (x_second - x_first) >= bound``; object -1 is the world's origin."""
+
+    first: Index  # (Q,) object rows, or -1
+    second: Index  # (Q,) object rows
+    direction: Array  # (Q, 3) unit
+    bound: Array  # (Q,) m
+
+
+def near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
+    """Object pairs of one scene whose boxes are within reach of each other: (P,), (P,)."""
+    low, high = object_boxes(place(collider.library, objects, "coarse"))
+    first, second = scene_pairs(objects)
+    near = ((low[first] <= high[second] + _REACH) & (low[second] <= high[first] + _REACH)).all(axis=1)
+    return first[near], second[near]
+
+
+def separating_planes(
+    collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array, budget: Budget
+) -> Planes:
+    """Planes that keep object pairs apart.
+
+    Every pair of parts gets a face plane that separates the two parts now. Among several such planes the one with the
+    least move away from home is taken. Coarse parts are used where they are already apart, fine ones elsewhere.
+
+    Args:
+        collider: Geometry and exact distances.
+        objects: Objects of one scene, at their current translations.
+        first, second: (P,) object rows.
+        extra: (P, 3) vector added to the offset of each pair, m: the minimum translation, for pairs that overlap.
+        home: (n, 3) wanted translations of the objects, m.
+        budget: Work budget, charged with one unit per plane.
+    """
+    coarse, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
+    budget.spend(len(coarse.pair))
+    nested = np.unique(coarse.pair[~apart])
+    if not len(nested):
+        return coarse.planes(np.ones(len(coarse.pair), dtype=bool))
+    kept = coarse.planes(~np.isin(coarse.pair, nested))
+    fine, apart = _planes_at("fine", collider, objects, first[nested], second[nested], extra[nested], home)
+    budget.spend(len(fine.pair))
+    return kept + fine.planes(np.ones(len(fine.pair), dtype=bool))
+
+
+@dataclass(frozen=True, eq=False)
+class _PartPlanes:
+    """One plane per near pair of parts; ``pair`` (Q,) is the index of the object pair."""
+
+    pair: Index
+    first: Index
+    second: Index
+    direction: Array
+    bound: Array
+
+    def planes(self, rows: Mask) -> Planes:
+        """As half-spaces for the objects."""
+        return Planes(self.first[rows], self.second[rows], self.direction[rows], self.bound[rows])
+
+
+def _planes_at(
+    level: str, collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array
+) -> tuple[_PartPlanes, Mask]:
+    placed = place(collider.library, objects, level)  # type: ignore[arg-type]
+    pair, a, b = part_pairs(placed, first, second)
+    move = extra[pair]
+    near = ((placed.low[a] <= placed.high[b] + move + _REACH) & (placed.low[b] + move <= placed.high[a] + _REACH)).all(
+        axis=1
+    )
+    pair, a, b = pair[near], a[near], b[near]
+    offset = objects.translation[second] - objects.translation[first] + extra
+    away = (home[second] - home[first] - offset)[pair]
+    offset = offset[pair]
+    direction, bound, best = np.empty((len(pair), 3)), np.empty(len(pair)), np.empty(len(pair))
+    for rows, gaps, normals in grouped_gaps(collider.library, placed.parts, a, b, offset):
+        largest = gaps.max(axis=1)
+        at_home = gaps + np.einsum("qki,qi->qk", normals, away[rows])
+        separates = gaps >= np.minimum(largest, 0.0)[:, None] - _APART
+        chosen = np.where(separates, at_home, -np.inf).argmax(axis=1)
+        line = np.arange(len(rows))
+        direction[rows], best[rows] = normals[line, chosen], largest
+        bound[rows] = np.einsum("qi,qi->q", direction[rows], offset[rows]) - gaps[line, chosen] + CLEARANCE
+    return _PartPlanes(pair, first[pair], second[pair], direction, bound), best >= -_APART
+
+
+def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget, cost: Array | None = None) -> Array:
+    """Translations (n, 3) nearest to ``home`` that satisfy the planes as well as possible.
+
+    Groups of objects that no plane connects are solved separately. ``budget`` is charged with the rows solved.
+    ``cost`` (3,) is the cost of a metre along each axis of the world; None means 1.
+    """
+    if cost is not None:
+        direction = planes.direction / cost
+        size = np.linalg.norm(direction, axis=1)
+        scaled = Planes(planes.first, planes.second, direction / size[:, None], planes.bound / size)
+        return nearest(objects, home * cost, scaled, budget) / cost
+    result = home.copy()
+    free = ~objects.fixed
+    mobile = lambda rows: (rows >= 0) & free[rows]  # noqa: E731
+    moves_first, moves_second = mobile(planes.first), mobile(planes.second)
+    both = moves_first & moves_second
+    label = components(len(objects), planes.first[both], planes.second[both])
+    owner = np.where(moves_second, label[planes.second], label[planes.first])
+    start = np.where(planes.first[:, None] >= 0, home[planes.first], 0.0)
+    needed = planes.bound - np.einsum("qi,qi->q", planes.direction, home[planes.second] - start)
+    for block in np.unique(owner[needed > 0]):
+        rows = np.flatnonzero(owner == block)
+        members = np.flatnonzero((label == block) & free)
+        column = np.full(len(objects) + 1, -1, dtype=np.int64)
+        column[members] = np.arange(len(members))
+        matrix = np.zeros((len(rows), len(members) + 1, 3))
+        line = np.arange(len(rows))
+        matrix[line, column[planes.second[rows]]] += planes.direction[rows]
+        matrix[line, column[planes.first[rows]]] -= planes.direction[rows]
+        moved = least_distance(matrix[:, :-1].reshape(len(rows), -1), needed[rows], budget)
+        result[members] += moved.reshape(-1, 3)
+    return result
+
+
+def least_distance(matrix: Array, needed: Array, budget: Budget) -> Array:
+    """The shortest x with ``matrix @ x + s >= needed``, slack s costing ``_SLACK`` squared.
+
+    Lawson and Hanson's least-distance programme (1974, ch. 23) through non-negative least squares on its dual.
+    Most rows hold anyway, so a row joins the problem only when a solution without the row violates it. Problems of
+    more than ``_EXACT`` rows, and those on which the exact method fails, are solved approximately. When ``budget`` is
+    spent, the last solution is returned.
+    """
+    x = np.zeros(matrix.shape[1])
+    used = needed > 0
+    broken = used
+    while broken.any() and not budget.is_spent:
+        used = used | broken
+        rows = np.flatnonzero(used)
+        budget.spend(min(len(rows), _EXACT) ** 2 / _ROWS_SQUARED)
+        x = _exact(matrix[rows], needed[rows]) if len(rows) <= _EXACT else _approximate(matrix[rows], needed[rows])
+        broken = ~used & (matrix @ x < needed - _MET)
+    return x
+
+
+def _exact(matrix: Array, needed: Array) -> Array:
+    """Solution with all rows, through non-negative least squares."""
+    count, width = matrix.shape
+    system = np.vstack([matrix.T, np.eye(count) / _SLACK, needed])
+    target = np.zeros(len(system))
+    target[-1] = 1.0
+    try:
+        multipliers, _ = nnls(system, target, maxiter=int(min(30 * count, max(3 * count, _ITERATIONS / system.size))))
+    except RuntimeError:  # out of iterations
+        return _approximate(matrix, needed)
+    residual = system @ multipliers - target
+    return -residual[:width] / residual[-1]  # type: ignore[no-any-return]
+
+
+def _approximate(matrix: Array, needed: Array) -> Array:
+    """Solution after a set number of steps of accelerated projected gradient ascent on the dual.
+
+    FISTA (Beck and Teboulle, 2009), started again whenever its momentum points downhill (O'Donoghue and Candes, 2015).
+    """
+    sparse = csr_array(matrix)
+    transposed = csr_array(matrix.T)
+    size = abs(sparse)
+    step = 1.0 / (float(size.sum(axis=0).max()) * float(size.sum(axis=1).max()) + _SLACK**-2)
+    multipliers = ahead = np.zeros(len(needed))
+    momentum = 1.0
+    for _ in range(_MAX_SOLVER_STEPS):
+        slope = needed - sparse @ (transposed @ ahead) - ahead / _SLACK**2
+        new = np.maximum(ahead + step * slope, 0.0)
+        if slope @ (new - multipliers) < 0:
+            momentum = 1.0
+        following = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * momentum**2))
+        ahead = new + (momentum - 1.0) / following * (new - multipliers)
+        multipliers, momentum = new, following
+    return transposed @ multipliers  # type: ignore[no-any-return]
+
+
+_AROUND = 0.06
+"""Parts further apart than this (m) are ignored when a translation is measured."""
+_OWN = 4
+"""Face directions tried per object pair from its deepest parts, and from its shallowest, besides the common ones."""
+_MAX_WALK_STEPS = 6
+"""Largest number of steps of a walk; each step leaves one overlapping part."""
+_DOWN = 3.0
+"""Cost factor of a translation down, out of a fixed object: an object that lies in a board belongs on it."""
+_UP = 1.4
+"""Cost factor of a vertical translation of two free objects: the lower one rests on something and cannot share it."""
+_BLOCKED = 20.0
+"""Cost factor of a translation that leaves the workspace or ends in a fixed object."""
+_REPEATED = 2.5
+"""Cost factor of a direction for each time that it was tried and did not help."""
+_SAME_DIRECTION = 0.7
+"""Cosine above which two directions count as the same."""
+_AXES = np.concatenate([np.eye(3), -np.eye(3)])
+
+Tried = dict[tuple[int, int], list[Array]]
+"""The directions tried for each object pair so far."""
+
+
+def minimum_translations(
+    collider: Collider,
+    objects: Objects,
+    first: Index,
+    second: Index,
+    bounds: tuple[Array, Array],
+    tried: Tried,
+    budget: Budget,
+    cost: Array | None = None,
+) -> Array:
+    """(P, 3) m: translations that free overlapping object pairs when they are added to the offsets of the pairs.
+
+    Args:
+        collider: Geometry of the assets.
+        objects: Objects of one scene.
+        first, second: (P,) object rows.
+        bounds: Lowest and highest translations (n, 3), (n, 3) m.
+        tried: Directions that did not help; the directions of the returned translations are added to them.
+        budget: Work budget, charged with one unit per pair of parts.
+        cost: (3,) cost of a metre along each axis of the world; None for 1.
+    """
+    placed = place(collider.library, objects, "fine")
+    pair, a, b = part_pairs(placed, first, second)
+    near = ((placed.low[a] <= placed.high[b] + _AROUND) & (placed.low[b] <= placed.high[a] + _AROUND)).all(axis=1)
+    pair, a, b = pair[near], a[near], b[near]
+    budget.spend(len(pair))
+    offset = objects.translation[second] - objects.translation[first]
+    groups = list(grouped_gaps(collider.library, placed.parts, a, b, offset[pair]))
+    walk = _walk(objects, first, second, pair, groups, bounds)
+    directions = _directions(len(first), pair, groups, offset, walk)
+    lengths = _lengths(len(first), pair, groups, directions)
+    costs = lengths * _weights(collider, objects, first, second, directions, lengths, bounds)
+    if cost is not None:
+        costs *= np.linalg.norm(directions * cost, axis=-1)
+    for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+        for old in tried.get(key, ()):
+            costs[row, directions[row] @ old > _SAME_DIRECTION] *= _REPEATED
+    best = costs.argmin(axis=1)
+    line = np.arange(len(first))
+    for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+        tried.setdefault(key, []).append(directions[row, best[row]])
+    return directions[line, best] * (lengths[line, best] + CLEARANCE)[:, None]  # type: ignore[no-any-return]
+
+
+def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array, walk: Array) -> Array:
+    """(P, D, 3) directions to try.
+
+    They are the axes, the level directions away from and toward the other object, face normals of the overlapping
+    parts, and the direction of ``walk``.
+    """
+    directions = np.zeros((count, 9 + 2 * _OWN, 3))
+    directions[:, :6] = _AXES
+    level = offset * np.array([1.0, 1.0, 0.0])
+    length = np.linalg.norm(level, axis=1, keepdims=True)
+    level = np.where(length > 1e-6, level / np.maximum(length, 1e-6), np.array([1.0, 0.0, 0.0]))
+    directions[:, 6], directions[:, 7] = level, -level
+    directions[:, 8:] = level[:, None]
+    rows = np.concatenate([group[0] for group in groups])
+    depth, direction = np.empty(len(rows)), np.empty((len(rows), 3))
+    start = 0
+    for _, gaps, normals in groups:
+        best = gaps.argmax(axis=1)
+        line = np.arange(len(best))
+        depth[start : start + len(best)], direction[start : start + len(best)] = -gaps[line, best], normals[line, best]
+        start += len(best)
+    inside = depth > 0
+    owner, depth, direction = pair[rows][inside], depth[inside], direction[inside]
+    # The deepest parts first, then the shallowest.
+    for base, order in ((8, np.lexsort((-depth, owner))), (8 + _OWN, np.lexsort((depth, owner)))):
+        _, leading, members = np.unique(owner[order], return_index=True, return_counts=True)
+        rank = np.arange(len(order)) - np.repeat(leading, members)
+        top = order[rank < _OWN]
+        directions[owner[top], base + rank[rank < _OWN]] = direction[top]
+    length = np.linalg.norm(walk, axis=1)
+    directions[length > 0, -1] = walk[length > 0] / length[length > 0, None]
+    return directions
+
+
+def _walk(
+    objects: Objects,
+    first: Index,
+    second: Index,
+    pair: Index,
+    groups: list[tuple[Index, Array, Array]],
+    bounds: tuple[Array, Array],
+) -> Array:
+    """(P, 3) m: sum of several steps, each out of the part that is then the deepest; leads out of corners.
+
+    From fixed objects, steps down and steps out of the workspace are avoided.
+    """
+    free = np.where(objects.fixed[first], second, first)
+    sign = np.where(objects.fixed[first], 1.0, -1.0)
+    held = objects.fixed[first] | objects.fixed[second]
+    walk = np.zeros((len(first), 3))
+    for _ in range(_MAX_WALK_STEPS):
+        depth, direction = np.zeros(len(pair)), np.zeros((len(pair), 3))
+        for rows, gaps, normals in groups:
+            owner = pair[rows]
+            now = gaps + np.einsum("qki,qi->qk", normals, walk[owner])
+            cost = now.copy()
+            q = np.flatnonzero(held[owner] & (now < 0).all(axis=1))
+            if len(q):
+                step = normals[q] * sign[owner[q], None, None]
+                here = objects.translation[free[owner[q]]] + sign[owner[q], None] * walk[owner[q]]
+                there = here[:, None] - step * now[q][..., None]
+                low, high = (bound[free[owner[q]]][:, None] for bound in bounds)
+                leaves = ((there < low) | (there > high)).any(axis=2)
+                cost[q] *= np.where(leaves, _BLOCKED, np.where(step[..., 2] < -0.7, _DOWN, 1.0))
+            best = cost.argmax(axis=1)
+            line = np.arange(len(rows))
+            depth[rows], direction[rows] = -now[line, best], normals[line, best]
+        order = np.lexsort((-depth, pair))
+        owner, leading = np.unique(pair[order], return_index=True)
+        deepest = order[leading]
+        inside = depth[deepest] > 1e-7
+        if not inside.any():
+            break
+        walk[owner[inside]] += (direction[deepest] * (depth[deepest] + 1e-7)[:, None])[inside]
+    return walk
+
+
+def _lengths(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], directions: Array) -> Array:
+    """(P, D) m: length of the move in each direction until no parts overlap."""
+    enter = np.full((len(pair), directions.shape[1]), np.inf)
+    leave = np.full_like(enter, -np.inf)
+    for rows, gaps, normals in groups:
+        speed = np.einsum("qki,qdi->qkd", normals, directions[pair[rows]])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            when = -gaps[..., None] / speed
+        never = ((np.abs(speed) < 1e-9) & (gaps[..., None] >= 0)).any(axis=1)
+        enter[rows] = np.where(speed < -1e-9, when, -np.inf).max(axis=1)
+        leave[rows] = np.where(speed > 1e-9, when, np.inf).min(axis=1)
+        enter[rows] = np.where(never, np.inf, enter[rows])
+    order = np.argsort(pair, kind="stable")
+    enter, leave, owner = enter[order], leave[order], pair[order]
+    present, starts = np.unique(owner, return_index=True)
+    length = np.zeros((count, directions.shape[1]))
+    for _ in range(24):
+        here = length[owner]
+        inside = (enter < here + 1e-7) & (leave > here + 1e-7)
+        further = np.where(inside, leave, 0.0)
+        new = np.maximum(length[present], np.maximum.reduceat(further, starts, axis=0))
+        if (new <= length[present] + 1e-9).all():
+            break
+        length[present] = new
+    return np.where(np.isfinite(length), length, 10.0)
+
+
+def _weights(
+    collider: Collider,
+    objects: Objects,
+    first: Index,
+    second: Index,
+    directions: Array,
+    lengths: Array,
+    bounds: tuple[Array, Array],
+) -> Array:
+    """(P, D) cost factors of a metre in each direction."""
+    weight = np.ones(lengths.shape)
+    fixed = objects.fixed[first] | objects.fixed[second]
+    # The motion of the free object, or of the upper one of two.
+    upper = np.where(
+        objects.fixed[first],
+        second,
+        np.where(
+            objects.fixed[second] | (objects.translation[first, 2] > objects.translation[second, 2]), first, second
+        ),
+    )
+    motion = np.where((upper == second)[:, None, None], directions, -directions)
+    weight[fixed[:, None] & (motion[..., 2] < -0.7)] *= _DOWN
+    weight[~fixed[:, None] & (np.abs(motion[..., 2]) > 0.7)] *= _UP
+    target = objects.translation[upper][:, None] + motion * lengths[..., None]
+    low, high = bounds
+    leaves = ((target < low[upper][:, None] - 1e-6) | (target > high[upper][:, None] + 1e-6)).any(axis=2)
+    weight[leaves & (fixed[:, None] | (motion[..., 2] > 0.7))] *= _BLOCKED
+    if objects.fixed.any():
+        low, high = object_boxes(place(collider.library, objects, "coarse"))
+        boards = place(collider.library, objects[objects.fixed], "coarse")
+        rise = np.where(motion[..., 2] > 0.7, lengths, 0.0)  # (P, D)
+        over = (boards.low[None, :, :2] < high[upper][:, None, :2]) & (
+            boards.high[None, :, :2] > low[upper][:, None, :2]
+        )
+        above = over.all(axis=2) & (boards.low[None, :, 2] > 0.5 * (low[upper] + high[upper])[:, None, 2])
+        room = np.where(above, boards.low[None, :, 2] - high[upper][:, None, 2], np.inf).min(axis=1)
+        weight[(rise > np.maximum(room, 0.0)[:, None]) & ~fixed[:, None]] *= _BLOCKED
+    return weight
+
+
+_HEAP = 3_000_000
+"""A group of objects whose boxes meet may be a heap when it takes more corner tests than this."""
+_DEEP = 5e-3
+"""Such a group is a heap when objects whose boxes have most in common overlap deeper than this (m)."""
+_LOOKED_AT = 3
+"""Number of object pairs measured for this: those whose common box is the largest share of the smaller box."""
+_WINDOWS = (0.3, 1.0, 4.0, 20.0)
+"""Half widths (m) of the cubes around a wanted place that are searched, one after the other."""
+_BINS = 16
+"""Coordinates tested along each axis come from this many equal intervals, at most two from each."""
+_FIXED = 1000
+"""Overlapping a box of a fixed object counts as much as overlapping this many free objects."""
+
+
+def heaps(collider: Collider, objects: Objects) -> Mask:
+    """(n,) free objects of one scene in groups that overlap so much that exact tests would take too long.
+
+    Objects nested as intended meet as many others but hardly overlap, so they are no heap.
+    """
+    low, high = object_boxes(place(collider.library, objects, "coarse"))
+    first, second = scene_pairs(objects)
+    meet = ((low[first] < high[second]) & (low[second] < high[first])).all(axis=1)
+    first, second = first[meet], second[meet]
+    free = ~objects.fixed
+    both = free[first] & free[second]
+    group = components(len(objects), first[both], second[both])
+    owner = group[np.where(free[first], first, second)]
+    tests = np.bincount(owner, weights=corner_tests(collider.library, objects, first, second), minlength=len(objects))
+    chosen = np.zeros(len(objects), dtype=bool)
+    for number in np.flatnonzero(tests > _HEAP):
+        a, b = first[owner == number], second[owner == number]
+        common = np.prod(np.minimum(high[a], high[b]) - np.maximum(low[a], low[b]), axis=1)
+        smaller = np.minimum(np.prod(high[a] - low[a], axis=1), np.prod(high[b] - low[b], axis=1))
+        most = np.argsort(-common / np.maximum(smaller, 1e-12), kind="stable")[:_LOOKED_AT]
+        looked_at = objects[np.unique(np.concatenate([a[most], b[most]]))]
+        if collider.pairs(looked_at).depth.max(initial=0.0) > _DEEP:
+            chosen |= free & (group == number)
+    return chosen
+
+
+def spread(
+    library: LibraryGeometry, objects: Objects, chosen: Mask, wanted: Array, bounds: tuple[Array, Array]
+) -> Array:
+    """Translations (n, 3) m at which the boxes of the chosen objects meet no other box, as far as there is room.
+
+    Args:
+        library: Geometry of the assets.
+        objects: Objects of one scene; those not chosen stay.
+        chosen: (n,) free objects to place anew.
+        wanted: (n, 3) wanted translations of the chosen objects, m.
+        bounds: Lowest and highest translations (n, 3), (n, 3) m.
+    """
+    coarse = place(library, objects, "coarse")
+    low, high = object_boxes(coarse)
+    rows = np.flatnonzero(chosen)
+    order = rows[np.argsort(-np.prod(high[rows] - low[rows], axis=1), kind="stable")]
+    low_of, high_of = low[order] - objects.translation[order], high[order] - objects.translation[order]
+    owner = np.repeat(np.arange(len(objects)), coarse.count)
+    boards, others = objects.fixed[owner], ~objects.fixed & ~chosen
+    lows = np.concatenate([coarse.low[boards], low[others], np.empty((len(order), 3))])
+    highs = np.concatenate([coarse.high[boards], high[others], np.empty((len(order), 3))])
+    weight = np.ones(len(lows), dtype=np.int64)
+    weight[: int(boards.sum())] = _FIXED
+    count = len(lows) - len(order)
+    result = objects.translation.copy()
+    for row, box_low, box_high in zip(order, low_of, high_of, strict=True):
+        limits = (bounds[0][row], bounds[1][row])
+        blocked = (lows[:count] - box_high - CLEARANCE, highs[:count] - box_low + CLEARANCE)
+        result[row] = _free_place(np.clip(wanted[row], *limits), *blocked, weight[:count], limits)
+        lows[count], highs[count] = result[row] + box_low, result[row] + box_high
+        count += 1
+    return result
+
+
+def _free_place(wanted: Array, low: Array, high: Array, weight: Index, limits: tuple[Array, Array]) -> Array:
+    """The place (3,) near ``wanted`` that lies in the fewest of the blocked open boxes ``low``, ``high`` (M, 3).
+
+    It lies in none of them if there is such a place. A box counts as ``weight`` (M,) boxes.
+    """
+    found = wanted
+    for reach in _WINDOWS:
+        start, end = np.maximum(wanted - reach, limits[0]), np.minimum(wanted + reach, limits[1])
+        near = ((low < end) & (high > start)).all(axis=1)
+        lines = [
+            _lines(np.concatenate([low[near, axis], high[near, axis]]), wanted[axis], start[axis], end[axis])
+            for axis in range(3)
+        ]
+        spans = [
+            np.column_stack([np.searchsorted(line, low[near, axis], "right"), np.searchsorted(line, high[near, axis])])
+            for axis, line in enumerate(lines)
+        ]
+        crowd = np.zeros([len(line) for line in lines], dtype=np.int32)
+        for (x, x_end), (y, y_end), (z, z_end), load in zip(
+            *(span.tolist() for span in spans), weight[near].tolist(), strict=True
+        ):
+            crowd[x:x_end, y:y_end, z:z_end] += load
+        x, y, z = ((line - middle) ** 2 for line, middle in zip(lines, wanted, strict=True))
+        least = crowd.min()
+        way = np.where(crowd == least, x[:, None, None] + y[:, None] + z, np.inf)
+        best = np.unravel_index(int(way.argmin()), way.shape)
+        found = np.array([line[index] for line, index in zip(lines, best, strict=True)])
+        if least == 0:
+            break
+    return found
+
+
+def _lines(faces: Array, wanted: float, start: float, end: float) -> Array:
+    """Ascending coordinates to test: the wanted one, both ends, and faces between them, thinned evenly."""
+    inside = np.sort(faces[(faces > start) & (faces < end)])
+    bins = np.minimum((inside - start) / max(end - start, 1e-12) * _BINS, _BINS - 1).astype(np.int64)
+    lowest = np.searchsorted(bins, np.arange(_BINS))
+    highest = np.searchsorted(bins, np.arange(_BINS), "right") - 1
+    used = highest >= lowest
+    return np.unique(np.concatenate([[wanted, start, end], inside[lowest[used]], inside[highest[used]]]))
+
 
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 

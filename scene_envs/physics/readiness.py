@@ -11,11 +11,18 @@ import torch
 from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics.api import check_numbers, project
-from scene_envs.physics.batches import poses_after, run_kernel, spent, stack, valid_rows
+from scene_envs.physics.api import (
+    ReadyResult,
+    check_numbers,
+    poses_after,
+    project,
+    run_kernel,
+    spent,
+    stack,
+    valid_rows,
+)
 from scene_envs.physics.motion import CONVERGED, ITERATIONS
 from scene_envs.physics.pool import PhysicsPool
-from scene_envs.physics.results import ReadyResult
 from scene_envs.scene import SceneBatch
 
 _READY_DEPTH = 1e-4

@@ -6,8 +6,8 @@ import atexit
 import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_envs.arrays import Array, Index
 from scene_envs.assets import Asset, get_library
-from scene_envs.scene_types import Camera
-from scene_envs.silence import quiet_pybullet
+from scene_envs.errors import InvalidInputError
+from scene_envs.progress import quiet_pybullet
+from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type
 
 _AWAY = (0.0, 0.0, -1000.0)
 _CELL, _CELLS = 8, 32
@@ -194,3 +196,327 @@ def vertex_colors(asset: Asset) -> NDArray[np.uint8]:
 def _color_codes(asset: Asset) -> NDArray[np.int64]:
     rgb = vertex_colors(asset).astype(np.int64)
     return (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]
+
+
+_SIDES = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_TOP = np.array([0.0, 0.0, 1.0])
+_RAYS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Framing:
+    """Points to show, with the directions of camera and lamp."""
+
+    points: Array  # (P, 3) points that the picture shows, world frame, m
+    to_camera: Array  # (3,) unit vector from the scene towards the camera
+    to_light: Array  # (3,) unit vector from the scene towards the lamp
+    ground: float  # lowest z of all supports, m
+
+    @property
+    def center(self) -> Array:
+        """(3,) middle of the bounding box of the points, m."""
+        return 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))
+
+    @property
+    def radius(self) -> float:
+        """Largest distance (m) of a point from the centre."""
+        return float(np.linalg.norm(self.points - self.center, axis=1).max())
+
+
+@lru_cache(maxsize=64)
+def frame_scene_type(scene_type: SceneType) -> Framing:
+    """Framing of scenes of this type.
+
+    A support that rises through the workspace (a shelf) is seen whole, from its open side and slightly above. A support
+    that is open above (a bin) is seen steeply from above. If objects stand on a support (a table, a floor) or on
+    nothing, the view is a three-quarter view from above, across the longer side; it is steeper for flatter workspaces.
+    """
+    low, high = (np.array(corner) for corner in scene_type.workspace)
+    extent = high - low
+    boxes, vertices = _fixed_geometry(scene_type)
+    ground = float(min(low[2], vertices[:, 2].min(initial=np.inf)))
+    if vertices[:, 2].max(initial=-np.inf) > low[2] + 0.25 * extent[2]:
+        side = _open_side(boxes)
+        top = vertices[:, 2].max()
+        above = _footprint(low, high, 1.0, max(top, high[2]))
+        points = np.concatenate([vertices, above])
+        if side is None:
+            return Framing(points, _direction(_across(extent), 52.0), _direction(_across(extent) - 85.0, 62.0), ground)
+        facing = float(np.degrees(np.arctan2(side[1], side[0])))
+        return Framing(points, _direction(facing - 30.0, 15.0), _direction(facing + 12.0, 30.0), ground)
+    flatness = float(np.clip(2.0 - extent[2] / (0.18 * extent[:2].max()), 0.0, 1.0))  # 0: a table, 1: a room
+    azimuth, elevation = _across(extent) * (1.0 - flatness) - 24.0 * flatness, 37.0 + 10.0 * flatness
+    upper = vertices[vertices[:, 2] >= low[2] - 0.05 * extent[:2].max()]
+    height = min(0.6 * extent[:2].min(), 0.75 * extent[2])
+    filled = _footprint(low, high, 0.7, low[2] + height)
+    base = upper if len(upper) else _footprint(low, high, 1.0, low[2])
+    points = np.concatenate([base, filled])
+    return Framing(points, _direction(azimuth, elevation), _direction(azimuth - 85.0, 57.0), ground)
+
+
+def scene_type_of_one(scene_type: SceneType, translations: Array, rotations: Array, categories: Index) -> SceneType:
+    """Scene type for the framing of one scene, in which its only support counts as fixed.
+
+    A union of scene types has no fixed objects and the workspace of the largest type, in which a table would be tiny. A
+    scene with one welded object is framed as if this object were fixed there; any other scene is framed as
+    ``scene_type``.
+
+    Args:
+        scene_type: Scene type of the scene.
+        translations: (N, 3) translations, m.
+        rotations: (N, 3, 3) rotations.
+        categories: (N,) int64; the number of assets is the category of empty slots.
+    """
+    names = np.array([*scene_type.assets, ""])[categories]
+    supports = np.flatnonzero(np.isin(names, scene_type.welded))
+    if scene_type.fixed or len(supports) != 1:
+        return scene_type
+
+    def fixed(slots: Index) -> SceneType:
+        poses = ((translations[slot].tolist(), rotations[slot].ravel().tolist()) for slot in slots)
+        objects = (FixedObject(str(names[slot]), *map(tuple, pose)) for slot, pose in zip(slots, poses, strict=True))
+        return replace(scene_type, fixed=tuple(objects))
+
+    support = fixed(supports)
+    vertices = _fixed_geometry(support)[1]
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    lost = np.abs(translations - 0.5 * (low + high)).max(axis=1) > (high - low).max()
+    objects = np.flatnonzero((names != "") & (np.arange(len(names)) != supports[0]) & ~lost)
+    low[2] = translations[objects, 2].min(initial=high[2])
+    tops = _fixed_geometry(fixed(objects))[1][:, 2]
+    high[2] = max(high[2], tops.max(initial=-np.inf), low[2] + 0.1 * (high - low)[:2].max())
+    return replace(support, workspace=(tuple(low.tolist()), tuple(high.tolist())))
+
+
+def fit_camera(points: Array, to_camera: Array, fov_y: float, aspect: float, margin: float) -> tuple[Array, Array]:
+    """Position and target (m) of the nearest camera without roll that sees all points.
+
+    Args:
+        points: (P, 3) points, m.
+        to_camera: (3,) unit vector from the scene to the camera; not vertical.
+        fov_y: Vertical field of view, degrees.
+        aspect: Ratio of width to height.
+        margin: Share of the half image that stays free at each border.
+    """
+    right = np.cross(_TOP, to_camera)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(to_camera, right), to_camera])
+    seen = points @ axes.T  # (P, 3): right, up, towards the camera
+    slope = np.tan(np.radians(fov_y) / 2.0) * (1.0 - margin) * np.array([aspect, 1.0])
+    # A camera at (x, y, d) sees a point when |x_p - x| <= slope_x (d - d_p), and the same for y.
+    upper = (seen[:, :2] + slope * seen[:, 2:]).max(axis=0)
+    lower = (-seen[:, :2] + slope * seen[:, 2:]).max(axis=0)
+    distance = float(((upper + lower) / (2.0 * slope)).max())
+    place = np.array([*(0.5 * (upper - lower)), distance])
+    target = np.array([place[0], place[1], 0.5 * (seen[:, 2].min() + seen[:, 2].max())])
+    return place @ axes, target @ axes
+
+
+def _fixed_geometry(scene_type: SceneType) -> tuple[Array, Array]:
+    """World boxes (P, 2, 3) around the parts of fixed objects, and all corners (V, 3) of those parts, m."""
+    boxes, vertices = [np.empty((0, 2, 3))], [np.empty((0, 3))]
+    for fixed in scene_type.fixed:
+        rotation = np.reshape(fixed.rotation, (3, 3))
+        for part in scene_type.library[fixed.asset].fine:
+            corners = part.vertices @ rotation.T + np.array(fixed.translation)
+            vertices.append(corners)
+            boxes.append(np.stack([corners.min(axis=0), corners.max(axis=0)])[None])
+    return np.concatenate(boxes), np.concatenate(vertices)
+
+
+def _open_side(boxes: Array) -> Array | None:
+    """The horizontal direction with the clearest view; None if the view from straight above is as clear."""
+    covered = [_covered(boxes, side) for side in _SIDES]
+    return None if _covered(boxes, _TOP) <= min(covered) else _SIDES[int(np.argmin(covered))]
+
+
+def _covered(boxes: Array, side: Array) -> float:
+    """Part of the view from ``side`` that boxes block before two thirds of the depth."""
+    axis = int(np.argmax(np.abs(side)))
+    across: Sequence[int] = [a for a in range(3) if a != axis]
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    depth = np.sort(boxes[:, :, axis] * side[axis], axis=1)
+    reach = max(low[axis] * side[axis], high[axis] * side[axis]) - (2.0 / 3.0) * (high[axis] - low[axis])
+    steps = (np.arange(_RAYS) + 0.5) / _RAYS
+    u, v = (low[a] + steps * (high[a] - low[a]) for a in across)
+    in_u, in_v = (
+        (boxes[:, 0, a, None] <= w) & (w <= boxes[:, 1, a, None]) & (depth[:, 1:] > reach)
+        for a, w in zip(across, (u, v), strict=True)
+    )
+    return float((in_u[:, :, None] & in_v[:, None, :]).any(axis=0).mean())
+
+
+def _footprint(low: Array, high: Array, share: float, z: float) -> Array:
+    """(4, 3): corners of the middle ``share`` of the workspace's footprint at height ``z``, m."""
+    center, half = 0.5 * (low + high), 0.5 * share * (high - low)
+    return np.array([[center[0] + i * half[0], center[1] + j * half[1], z] for i in (-1, 1) for j in (-1, 1)])
+
+
+def _across(extent: Array) -> float:
+    """Azimuth (degrees) of a camera that has the longer side of the workspace across its picture."""
+    return -28.0 if extent[1] > 1.25 * extent[0] else -62.0
+
+
+def _direction(azimuth: float, elevation: float) -> Array:
+    a, e = np.radians(azimuth), np.radians(elevation)
+    return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+
+
+_FOV = 28.0
+_MARGIN = 0.05
+_LAMP_PIXELS = 512, 1024
+"""Resolution of the lamp's depth image for framings of a radius up to 2 m, and for larger ones."""
+
+
+def picture_camera(scene_type: str | SceneType, width: int = 480, height: int = 360) -> Camera:
+    """The three-quarter view of pictures without a given camera.
+
+    It is derived from the workspace and the fixed objects (see
+    :func:`~scene_envs.render.stage.frame_scene_type`), so it also suits users' scene types.
+
+    Args:
+        scene_type: Scene type or its name.
+        width: Image width, pixels; width and height determine the distance of the camera.
+        height: Image height, pixels.
+
+    >>> camera = picture_camera("dimsum_table", 640, 480)
+    >>> camera.width, camera.fov_y
+    (640, 28.0)
+    """
+    if width < 1 or height < 1:
+        raise InvalidInputError(f"an image needs at least 1 x 1 pixels, got width={width}, height={height}")
+    framing = frame_scene_type(get_scene_type(scene_type))
+    position, target = fit_camera(framing.points, framing.to_camera, _FOV, width / height, _MARGIN)
+    return Camera(_triple(position), _triple(target), (0.0, 0.0, 1.0), width, height, _FOV)
+
+
+def light_camera(scene_type: SceneType) -> Camera:
+    """The view from a far lamp that sees the whole workspace."""
+    framing = frame_scene_type(scene_type)
+    distance = 8.0 * framing.radius
+    fov = 2.0 * np.degrees(np.arctan(1.1 * framing.radius / distance))
+    pixels = _LAMP_PIXELS[framing.radius > 2.0]
+    position = framing.center + distance * framing.to_light
+    return Camera(_triple(position), _triple(framing.center), (0.0, 1.0, 0.0), pixels, pixels, float(fov))
+
+
+def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
+    return (float(vector[0]), float(vector[1]), float(vector[2]))
+
+
+Image = NDArray[np.float32]
+
+
+def camera_points(frame: Frame) -> Image:
+    """(H, W, 3): the visible point of each pixel in the camera frame (x right, y up, z backward), m."""
+    height, width = frame.depth.shape
+    x = ((np.arange(width, dtype=np.float32) + 0.5) * (2.0 / width) - 1.0) / frame.focal[0]
+    y = (1.0 - (np.arange(height, dtype=np.float32) + 0.5) * (2.0 / height)) / frame.focal[1]
+    depth = np.where(np.isfinite(frame.depth), frame.depth, 0.0).astype(np.float32)
+    return np.stack([x[None, :] * depth, y[:, None] * depth, -depth], axis=-1).astype(np.float32)
+
+
+def surface_normals(frame: Frame, *, stride: int = 2) -> Image:
+    """(H, W, 3): unit normals in the camera frame, facing the camera; those of every ``stride``-th pixel are repeated.
+
+    Along each axis the difference to the nearer neighbour is taken, so that edges of objects stay sharp.
+    """
+    points = camera_points(frame)[::stride, ::stride]
+    along = [_shorter(np.diff(points, axis=axis), axis) for axis in (1, 0)]
+    normals = np.cross(along[1], along[0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    facing = np.where(np.einsum("hwk,hwk->hw", normals, points) > 0, np.float32(-1.0), np.float32(1.0))
+    return _enlarge((normals * facing[..., None]).astype(np.float32), stride, frame.depth.shape)
+
+
+def soft_shadow(
+    frame: Frame,
+    light: Frame,
+    normals: Image,
+    *,
+    bias: float = 0.004,
+    lift: float = 0.008,
+    softness: float = 1.8,
+    taps: int = 12,
+) -> Image:
+    """(H, W) in 0..1: the part of the light that nearer objects hide, by percentage-closer filtering.
+
+    Args:
+        frame: Frame of the camera.
+        light: Frame of the same scene seen from the light.
+        normals: (H, W, 3) normals from :func:`surface_normals`.
+        bias: Smallest difference in distance from the light (m) between an occluder and the point.
+        lift: Distance (m) by which points are raised off their surface, so that no surface shadows itself.
+        softness: Radius of the filter, pixels of ``light``.
+        taps: Number of samples of the filter.
+    """
+    seen = np.isfinite(frame.depth)
+    to_light = (light.view @ np.linalg.inv(frame.view)).astype(np.float32)
+    points = (camera_points(frame)[seen] + np.float32(lift) * normals[seen]) @ to_light[:3, :3].T + to_light[:3, 3]
+    distance = np.maximum(-points[:, 2], np.float32(1e-3))  # objects may lie behind the lamp
+    height, width = light.depth.shape
+    column = (points[:, 0] / distance * np.float32(light.focal[0]) + 1.0) * (0.5 * width)
+    row = (1.0 - points[:, 1] / distance * np.float32(light.focal[1])) * (0.5 * height)
+    nearest = light.depth.ravel()
+    hidden = np.zeros(len(points), dtype=np.float32)
+    for dx, dy in _spiral(taps) * softness:
+        index = _pixel(row + dy, height) * width + _pixel(column + dx, width)
+        hidden += nearest[index] < distance - bias
+    shadow = np.zeros(frame.depth.shape, dtype=np.float32)
+    shadow[seen] = hidden / taps
+    return shadow
+
+
+def contact_shade(frame: Frame, normals: Image, *, radius: float = 0.04, taps: int = 12, stride: int = 2) -> Image:
+    """(H, W) in 0..1: ambient occlusion of each point by its surroundings within ``radius`` m.
+
+    Computed for every ``stride``-th pixel of each axis and repeated; callers blur the result.
+    """
+    grid = camera_points(frame)[::stride, ::stride]
+    height, width = grid.shape[:2]
+    rows, columns = np.nonzero(grid[..., 2] < 0)
+    surroundings = grid.reshape(-1, 3)
+    points, facing = grid[rows, columns], normals[::stride, ::stride][rows, columns]
+    reach_x = (0.5 * width * frame.focal[0] * radius / -points[:, 2]).astype(np.float32)
+    reach_y = (0.5 * height * frame.focal[1] * radius / -points[:, 2]).astype(np.float32)
+    closed = np.zeros(len(points), dtype=np.float32)
+    for dx, dy in _spiral(taps):
+        index = _pixel(rows + 0.5 + dy * reach_y, height) * width + _pixel(columns + 0.5 + dx * reach_x, width)
+        offset = surroundings[index] - points
+        square = np.einsum("nk,nk->n", offset, offset) + np.float32(1e-8)
+        rise = np.einsum("nk,nk->n", offset, facing) / np.sqrt(square)
+        closed += np.maximum(rise - np.float32(0.12), 0.0) * (square < 4.0 * radius**2)
+    shade = np.zeros((height, width), dtype=np.float32)
+    shade[rows, columns] = closed / taps
+    return _enlarge(shade, stride, frame.depth.shape)
+
+
+def blur(image: Image, size: int) -> Image:
+    """(H, W) averaged over windows of ``size`` pixels."""
+    from scipy.ndimage import uniform_filter
+
+    return np.asarray(uniform_filter(image, size), dtype=np.float32)
+
+
+def _pixel(position: NDArray[np.float32], size: int) -> NDArray[np.int32]:
+    """The pixel that holds ``position`` (in pixels from the border), clamped to the image."""
+    return np.clip(position, 0, size - 1).astype(np.int32)
+
+
+def _enlarge(image: Image, stride: int, shape: tuple[int, ...]) -> Image:
+    return image.repeat(stride, axis=0).repeat(stride, axis=1)[: shape[0], : shape[1]]
+
+
+def _shorter(steps: Image, axis: int) -> Image:
+    """For each pixel the shorter of its backward and forward step: edges of objects are not crossed."""
+    first, last = np.take(steps, [0], axis=axis), np.take(steps, [-1], axis=axis)
+    backward, forward = np.concatenate([first, steps], axis=axis), np.concatenate([steps, last], axis=axis)
+    nearer = np.abs(backward[..., 2:]) <= np.abs(forward[..., 2:])
+    return np.where(nearer, backward, forward)
+
+
+def _spiral(taps: int) -> NDArray[np.float32]:
+    """(taps, 2): points spread evenly over the unit disc (sunflower)."""
+    index = np.arange(taps) + 0.5
+    radius, angle = np.sqrt(index / taps), index * np.pi * (3.0 - np.sqrt(5.0))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1).astype(np.float32)

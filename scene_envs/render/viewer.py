@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import base64
 import os
+import tempfile
+import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import logger
 from numpy.typing import NDArray
 
 from scene_envs.assets import Asset, ConvexPart
 from scene_envs.errors import InvalidInputError
-from scene_envs.files import write_text
-from scene_envs.pages import page_part, page_template
-from scene_envs.render.framing import frame_scene_type
-from scene_envs.render.stage import vertex_colors
+from scene_envs.files import page_part, page_template, write_text
+from scene_envs.render.stage import frame_scene_type, vertex_colors
 from scene_envs.rotations import matrix_to_quaternion
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
@@ -192,3 +193,43 @@ def _text(values: NDArray[Any]) -> str:
     """The values as little-endian bytes in base64."""
     little = np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"))
     return base64.b64encode(little.tobytes()).decode("ascii")
+
+
+class LiveViewer:
+    """All scenes shown so far, in one page that the browser reads again every two seconds.
+
+    The page lies in a temporary folder, and stays there when the viewer is closed.
+
+    Args:
+        title: Heading of the page.
+
+    Attributes:
+        path: Path of the page.
+    """
+
+    REFRESH = 2.0
+    """Seconds between two readings of the page."""
+
+    def __init__(self, title: str) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="scene-envs-")) / "viewer.html"
+        self._title = title
+        self._scenes: list[SceneBatch] = []
+        self._captions: list[str] = []
+
+    def show(self, scene: SceneBatch, caption: str) -> None:
+        """Add a scene (a batch of one); the first one opens the browser."""
+        self._scenes.append(scene)
+        self._captions.append(caption)
+        self._write(self.REFRESH)
+        if len(self._scenes) == 1 and not webbrowser.open(self.path.resolve().as_uri()):
+            logger.warn(f"no browser was found; open {self.path} in one")
+
+    def close(self) -> None:
+        """Write the page a last time, without refresh; it stays in its folder."""
+        if self._scenes:
+            self._write(None)
+            self._scenes, self._captions = [], []
+
+    def _write(self, refresh: float | None) -> None:
+        batch = SceneBatch.concatenate(self._scenes)
+        write_viewer(batch, self.path, captions=self._captions, title=self._title, refresh=refresh)

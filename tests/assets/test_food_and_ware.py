@@ -17,7 +17,7 @@ from scene_envs.physics import equilibrium, feasibility, penetration, project, s
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, FixedObject, SceneType
-from scene_envs.scene_types.built_in import BUILT_IN
+from scene_envs.scene_types.registry import BUILT_IN
 
 SIZES = {  # (x, y, z) m, handles aside
     "cereal_box": (0.19, 0.06, 0.28),

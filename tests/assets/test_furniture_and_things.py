@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
 from scene_envs.assets import get_library, list_assets
-from scene_envs.assets.recipes.shelf import TIERS
+from scene_envs.assets.recipes.furniture import TIERS
 from scene_envs.physics import feasibility, penetration, settle
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch

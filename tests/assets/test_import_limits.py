@@ -16,7 +16,8 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from scene_envs.assets import import_report, load_library
-from scene_envs.assets.importing import decomposition, user_library
+from scene_envs.assets.importing import solids as decomposition
+from scene_envs.assets.importing import user_library
 from scene_envs.assets.importing.limits import READ_HERE
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 

@@ -7,8 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from scene_envs.assets.panels import Patch, lettering, loft, moved, painted_box, painted_face
-from scene_envs.assets.shapes import circle
+from scene_envs.assets.shapes import Patch, circle, lettering, loft, moved, painted_box, painted_face
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 

@@ -15,9 +15,15 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from scene_envs.assets import Asset, ConvexPart, import_report, load_library
-from scene_envs.assets.importing import decomposition
-from scene_envs.assets.importing.decomposition import cache_folder, snap_to_surface
-from scene_envs.assets.importing.hulls import MAX_CORNERS, enclosing_hull, few_cornered_hull, thickness
+from scene_envs.assets.importing import solids as decomposition
+from scene_envs.assets.importing.solids import (
+    MAX_CORNERS,
+    cache_folder,
+    enclosing_hull,
+    few_cornered_hull,
+    snap_to_surface,
+    thickness,
+)
 from scene_envs.assets.shapes import box, convex_hull
 from scene_envs.errors import MissingDependencyError
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from agents.cli.keys import compose
-from agents.post_training.config import PostTrainConfig
+from agents.post_training.settings import PostTrainConfig
 from benchmarks.post_training.__main__ import main
 from benchmarks.post_training.rows import TABLES
 from benchmarks.post_training.runs import guard_figures, measure, training_figures

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from agents.configuration import dotted_values
-from agents.pretraining.config import PretrainConfig
+from agents.configuration.composition import dotted_values
+from agents.pretraining.settings import PretrainConfig
 from benchmarks.paper_tables import ALL_TABLES, Entry, Row, Table, TablesConfig, list_rows, make_tables
 from benchmarks.paper_tables.columns import COLUMNS, Column, error, expand, text
 from benchmarks.paper_tables.plot import draw

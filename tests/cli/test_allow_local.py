@@ -6,7 +6,7 @@ from importlib import import_module
 import pytest
 
 from agents.cli import main
-from rewards import local_files
+from rewards import registry as local_files
 
 MAIN = import_module("agents.cli.main")
 """The module; ``agents.cli.main`` is its function."""

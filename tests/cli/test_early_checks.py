@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from agents.cli import main
-from agents.configuration import MEASURE_NAMES, known_masks, known_rewards, known_scenes
+from agents.configuration.composition import MEASURE_NAMES, known_masks, known_rewards, known_scenes
 from agents.pretraining.settings import NETWORKS, registered_networks
 from agents.priors import list_priors
 from rewards import list_rewards
@@ -113,7 +113,10 @@ def test_the_names_that_are_known_without_torch_are_those_of_the_packages():
     own = {name for name in list_rewards() if (registered_module(name) or "").startswith("rewards.")}
     assert len(own) > 15
     assert len(list_priors()) > 8
-    code = "from agents.configuration import known_masks, known_rewards\nprint([known_masks(), known_rewards()])"
+    code = (
+        "from agents.configuration.composition import known_masks, known_rewards\n"
+        "print([known_masks(), known_rewards()])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     masks, rewards = ast.literal_eval(done.stdout)
     assert own <= set(rewards) <= set(list_rewards()) == set(known_rewards())
@@ -124,12 +127,9 @@ def test_the_names_that_are_known_without_torch_are_those_of_the_packages():
 
 
 def test_words_of_groups_are_those_of_the_parts_they_are_for():
-    from agents.diffusion.categorical import CATEGORICAL_KERNELS
-    from agents.diffusion.gaussian import PREDICTIONS, TIMESTEP_DISTRIBUTIONS
-    from agents.diffusion.schedules import _SCHEDULES
-    from agents.diffusion.unmasking import UNMASKINGS
-    from agents.diffusion.weighting import LOSS_WEIGHTINGS
-    from agents.evaluation.measures import MEASURES
+    from agents.diffusion.categorical import CATEGORICAL_KERNELS, UNMASKINGS
+    from agents.diffusion.gaussian import _SCHEDULES, LOSS_WEIGHTINGS, PREDICTIONS, TIMESTEP_DISTRIBUTIONS
+    from agents.evaluation.measure import MEASURES
     from agents.networks.denoisers import EMPTY_SLOTS
     from agents.networks.flux import TEXT_REACHES
     from agents.pretraining.initial_prior import MOMENTS

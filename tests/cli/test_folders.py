@@ -14,7 +14,7 @@ from agents.cli import main
 from agents.cli.commands.rewards import RewardsConfig
 from agents.priors.testing import tiny_prior
 from agents.utils.interrupts import Terminated, finishing_steps, terminable
-from scene_envs.folders import claimed
+from scene_envs.files import claimed
 
 MAIN = import_module("agents.cli.main")
 """The module; ``agents.cli.main`` is its function."""
@@ -105,7 +105,7 @@ def test_a_command_that_failed_before_it_had_results_may_be_repeated_with_other_
 
 def test_a_folder_that_is_being_written_is_refused(drawn, tmp_path, capsys):
     code = (
-        "import sys; from scene_envs.folders import claimed\n"
+        "import sys; from scene_envs.files import claimed\n"
         f"with claimed({str(tmp_path)!r}, 'scene-envs sample'): print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
@@ -210,7 +210,7 @@ def test_post_training_saves_when_it_is_told_to_end_and_goes_on_as_if_nothing_ha
 
 
 def test_a_log_has_no_row_twice_and_none_of_another_run(tmp_path):
-    from agents.pretraining.log import FIELDS, TrainingLog
+    from agents.pretraining.trainer import FIELDS, TrainingLog
 
     log = TrainingLog(tmp_path)
     for step in (1, 2, 3, 2, 3, 4):

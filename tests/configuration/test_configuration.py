@@ -16,10 +16,10 @@ from agents.cli import main
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import Sources, compose, help_text, keys_of
 from agents.cli.main import expand_sweeps
-from agents.configuration import changed, config_text, dotted_values, field_options
+from agents.configuration.composition import changed, config_text, dotted_values, field_options
 from agents.planning import list_planners
-from agents.planning.registry import planner_settings
-from agents.post_training.algorithms import algorithm_settings, list_algorithms
+from agents.planning.ledger import planner_settings
+from agents.post_training.settings import algorithm_settings, list_algorithms
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,8 +8,8 @@ import torch
 
 from agents.cli.keys import compose
 from agents.networks import parameter_count
-from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
+from agents.pretraining.settings import PretrainConfig
 from agents.priors.mixed import MixedPrior
 from scene_envs.errors import UnknownNameError
 from scene_envs.grammars import get_grammar

@@ -17,11 +17,20 @@ from agents.priors import ScenePrior
 from agents.priors.testing import tiny_prior
 from agents.utils.checkpoints import load_checkpoint, save_checkpoint
 from scene_envs import SceneBatch
-from scene_envs.datasets.store import read_notes
+from scene_envs.datasets.files import read_notes
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, StorageError
-from scene_envs.files import read_sealed, replacing, sealed, without_digest, write_text
-from scene_envs.folders import LOCK, claimed, sweep
-from scene_envs.tensor_files import read_tensors, write_tensors
+from scene_envs.files import (
+    LOCK,
+    claimed,
+    read_sealed,
+    read_tensors,
+    replacing,
+    sealed,
+    sweep,
+    without_digest,
+    write_tensors,
+    write_text,
+)
 
 
 def flipped(path: Path, bit: int) -> None:
@@ -112,7 +121,7 @@ def test_a_checksum_beside_a_file_is_verified_and_goes_with_the_file(tmp_path):
 
 
 def test_every_shipped_prior_has_a_checksum():
-    from agents.prior_names import SHIPPED
+    from agents.configuration.prior_names import SHIPPED
 
     for weights in SHIPPED.glob("*/model.safetensors"):
         assert b"sha256" in weights.read_bytes()[:100_000]
@@ -133,7 +142,7 @@ def test_an_edited_configuration_is_told_and_accepted_without_its_digest(tmp_pat
 
 
 def test_every_shipped_configuration_has_a_digest():
-    from agents.prior_names import SHIPPED
+    from agents.configuration.prior_names import SHIPPED
 
     for path in SHIPPED.glob("*/config.json"):
         content = json.loads(path.read_text())
@@ -144,7 +153,7 @@ def test_every_shipped_configuration_has_a_digest():
 def test_a_changed_footer_of_a_shard_is_found(tmp_path):
     import pyarrow.parquet as pq
 
-    from scene_envs.datasets.store import write_shard
+    from scene_envs.datasets.files import write_shard
 
     path = tmp_path / "scenes-00000.parquet"
     write_shard(path, np.zeros((3, 2, 16), np.float32), [("A scene.",)] * 3, {"tried": 5, "reasons": {}})
@@ -191,7 +200,7 @@ def test_a_write_that_is_refused_names_file_and_remedy_and_leaves_nothing(code, 
 
 def test_a_second_writer_is_told_who_the_first_is(tmp_path):
     code = (
-        "import sys; from scene_envs.folders import claimed\n"
+        "import sys; from scene_envs.files import claimed\n"
         f"with claimed({str(tmp_path)!r}, 'the first'): print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
@@ -223,7 +232,7 @@ def test_a_lock_of_another_computer_holds_while_it_gives_signs_of_life(tmp_path,
 
 
 def test_a_writer_gives_signs_of_life(tmp_path, monkeypatch):
-    monkeypatch.setattr("scene_envs.folders._BEAT", 0.01)
+    monkeypatch.setattr("scene_envs.files._BEAT", 0.01)
     with claimed(tmp_path, "the first"):
         os.utime(tmp_path / LOCK, (0, 0))
         for _ in range(500):

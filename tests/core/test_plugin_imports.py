@@ -11,8 +11,9 @@ import pytest
 
 from agents.cli import main
 from rewards import list_rewards
-from scene_envs import list_scene_types, plugins
-from scene_envs.plugins import PluginError, load_plugin, plugin_entry_points
+from scene_envs import list_scene_types
+from scene_envs import registry as plugins
+from scene_envs.registry import PluginError, load_plugin, plugin_entry_points
 
 HARMFUL = {
     "leaves": ("import sys; sys.exit(0)", "calls sys.exit"),

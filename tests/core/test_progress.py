@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from agents.post_training.progress import run_progress
+from agents.post_training.run_files import run_progress
 from scene_envs.errors import UnknownNameError
 from scene_envs.progress import Progress
 

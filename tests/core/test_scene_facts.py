@@ -89,7 +89,7 @@ def test_groups_name_built_in_assets_and_users_add_their_own(
     tilted: SceneBatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert set().union(*ASSET_GROUPS.values()) <= set(list_assets())
-    monkeypatch.setattr("scene_envs.assets.groups.ASSET_GROUPS", dict(ASSET_GROUPS))
+    monkeypatch.setattr("scene_envs.assets.base.ASSET_GROUPS", dict(ASSET_GROUPS))
     register_asset_group("breakable", ["bowl", "mug"])
     assert int(tilted.is_any_of("breakable").sum()) == 2
     with pytest.raises(InvalidInputError, match="the string 'bowl'"):

@@ -11,7 +11,7 @@ import torch
 
 from scene_envs.datasets import SceneDataset, generate, judge_scenes
 from scene_envs.datasets import shards as shards_module
-from scene_envs.datasets.progress import generation_progress
+from scene_envs.datasets.shards import generation_progress
 from scene_envs.errors import InvalidInputError, PhysicsError, UnknownNameError
 from scene_envs.grammars import register_grammar
 from tests.helpers.toy_grammars import CUPS_COUNT, ToyGrammar, generate_cups, toy_cups
@@ -108,7 +108,7 @@ def test_a_grammar_of_which_nothing_passes_is_given_up_with_the_reasons(
 
 
 def test_a_log_gets_lines_with_rate_and_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
-    from scene_envs.datasets import progress
+    from scene_envs.datasets import shards as progress
 
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)

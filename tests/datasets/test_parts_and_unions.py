@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from scene_envs.datasets import SceneDataset, to_union
-from scene_envs.datasets.splits import Part
-from scene_envs.datasets.union import union_normalizer
+from scene_envs.datasets.dataset import Part, union_normalizer
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch

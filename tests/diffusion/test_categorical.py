@@ -11,7 +11,7 @@ from agents.diffusion.categorical import (
     make_categorical_schedule,
     sample_categorical,
 )
-from agents.diffusion.step_tables import StepTable
+from agents.diffusion.gaussian import StepTable
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 K, T = 5, 20

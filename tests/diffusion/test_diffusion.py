@@ -7,8 +7,7 @@ import torch
 from diffusers import DDPMScheduler
 
 from agents.diffusion import GaussianProcess, Preconditioning, StepTable
-from agents.diffusion.gaussian import lognormal_timesteps, timestep_weights
-from agents.diffusion.schedules import make_schedule
+from agents.diffusion.gaussian import lognormal_timesteps, make_schedule, timestep_weights
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 D = 20

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from agents.diffusion import GaussianProcess, Preconditioning
-from agents.diffusion.schedules import make_schedule
-from agents.diffusion.weighting import check_weighting, loss_weights
+from agents.diffusion.gaussian import check_weighting, loss_weights, make_schedule
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError, UnknownNameError

@@ -7,7 +7,7 @@ import torch
 
 from agents.diffusion import CategoricalProcess, Preconditioning
 from agents.diffusion.categorical import make_categorical_schedule, sample_categorical
-from agents.diffusion.moments import CategoryMoments
+from agents.diffusion.gaussian import CategoryMoments
 
 
 def _data(count: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -10,8 +10,8 @@ from scipy.stats import chisquare, kstest
 from torch.distributions import Categorical, Normal
 
 from agents.diffusion import GaussianStep, MixedStep
+from agents.diffusion.categorical import systematic
 from agents.diffusion.reverse_steps import concatenate_steps, one_hot_state, state_of
-from agents.diffusion.unmasking import systematic
 
 
 def _mixed(batch: int = 1, slots: int = 2) -> MixedStep:

@@ -16,10 +16,10 @@ import yaml
 from agents import PostTrainConfig, PretrainConfig
 from agents.cli import main
 from agents.cli.keys import Sources, compose
-from agents.planning.registry import planner_settings
+from agents.planning.ledger import planner_settings
 from agents.post_training import DDPOSFLoss, DenoisingPolicy, compute_advantages
-from agents.post_training.algorithms import algorithm_settings, make_algorithm
 from agents.post_training.rollouts import collect
+from agents.post_training.settings import algorithm_settings, make_algorithm
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, check_reward, make_reward
 from scene_envs import SceneBatch, get_scene_type

@@ -24,7 +24,7 @@ MODES = ("next_sample", "noise")
 def flat_pictures(monkeypatch):
     """Pictures without a renderer: conformance of ``render`` is tested here, drawing is tested elsewhere."""
     blank = lambda batch: np.zeros((len(batch), 12, 16, 3), np.uint8)  # noqa: E731
-    monkeypatch.setattr("scene_envs.envs.denoising_gymnasium.picture", blank)
+    monkeypatch.setattr("scene_envs.envs.denoising_adapters.picture", blank)
 
 
 def actions(count, steps, seed=0):

@@ -16,22 +16,25 @@ from agents.planning.search_run import SearchConfig
 from agents.priors.testing import tiny_prior
 from rewards import RewardOutput
 from scene_envs.envs import SearchProblem, register_mask
-from scene_envs.envs.mask_generators import (
+from scene_envs.envs.masks import (
     BalancedMask,
     CulpritsMask,
     EmptyMask,
     ExplicitMask,
     LowestScoringMask,
+    MaskGenerator,
     OffPromptMask,
     RegionMask,
     blamed_or_empty_mask,
     cover,
     infeasible_mask,
     infeasible_or_empty_mask,
+    list_masks,
+    mask_for_prompt,
     penetrating_mask,
+    resolve_mask,
     unstable_mask,
 )
-from scene_envs.envs.masks import MaskGenerator, list_masks, mask_for_prompt, resolve_mask
 from scene_envs.envs.scoring import RewardScorer, Score
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.scene import SceneBatch
@@ -141,7 +144,7 @@ def test_feasibility_is_asked_of_physics_where_the_objective_says_nothing_of_it(
 
 
 def test_one_simulation_serves_the_mask_and_the_objective(monkeypatch: pytest.MonkeyPatch) -> None:
-    from rewards.verdicts import forget_verdicts
+    from rewards.feasible import forget_verdicts
     from scene_envs import physics
 
     calls: list[int] = []

@@ -19,7 +19,7 @@ from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.envs import DenoisingTorchRLEnv, SearchProblem
-from scene_envs.envs.prompts import grammar_prompts
+from scene_envs.envs.scoring import grammar_prompts
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_types import get_scene_type
 

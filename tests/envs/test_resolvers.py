@@ -9,8 +9,8 @@ import gymnasium as gym
 import pytest
 
 from agents.priors.testing import tiny_prior
-from scene_envs import plugins
-from scene_envs.envs import resolvers
+from scene_envs import registry as plugins
+from scene_envs.envs import scoring as resolvers
 from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
 from scene_envs.scene_types import get_scene_type
 

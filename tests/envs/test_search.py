@@ -34,7 +34,7 @@ def env(prior, free_objects):
 
 def test_check_env_passes_with_warnings_as_errors(prior, free_objects, monkeypatch):
     blank = lambda batch, highlight: np.zeros((len(batch), 12, 16, 3), np.uint8)  # noqa: E731
-    monkeypatch.setattr("scene_envs.envs.search_rendering.picture", blank)
+    monkeypatch.setattr("scene_envs.envs.search_gymnasium.picture", blank)
     monkeypatch.setattr("webbrowser.open", lambda address: True)
     env = gym.make(ID, prior=prior, objective=free_objects, branching=3, max_depth=3, num_steps=2)
     with warnings.catch_warnings():

@@ -40,7 +40,7 @@ def env(kwargs: dict[str, Any]) -> SearchMaskEnv:
 
 def test_check_env_passes_with_warnings_as_errors(kwargs: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     blank = lambda batch, highlight: np.zeros((len(batch), 12, 16, 3), np.uint8)  # noqa: E731
-    monkeypatch.setattr("scene_envs.envs.search_rendering.picture", blank)
+    monkeypatch.setattr("scene_envs.envs.search_gymnasium.picture", blank)
     monkeypatch.setattr("webbrowser.open", lambda address: True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -7,10 +7,8 @@ import pytest
 import torch
 
 from agents.evaluation import grammar_scenes
-from agents.evaluation.classifier import classifier_accuracy
-from agents.evaluation.scene_tokens import blurred, scene_tokens
-from agents.evaluation.set_network import SetNetwork, SetNetworkConfig
-from agents.evaluation.two_sample_test import Accuracy, ClassifierConfig
+from agents.evaluation.classifier import Accuracy, ClassifierConfig, classifier_accuracy
+from agents.evaluation.set_network import SetNetwork, SetNetworkConfig, blurred, scene_tokens
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 

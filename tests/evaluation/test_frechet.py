@@ -12,10 +12,16 @@ from scipy.linalg import sqrtm
 from torch import nn
 
 from agents.evaluation import grammar_scenes
-from agents.evaluation.frechet import feature_distance, frechet_scene_distance, gaussian_distance
-from agents.evaluation.inception import _Pooling, frechet_inception_distance, load_inception
-from agents.evaluation.scene_tokens import blurred
+from agents.evaluation.pictures import (
+    _Pooling,
+    feature_distance,
+    frechet_inception_distance,
+    frechet_scene_distance,
+    gaussian_distance,
+    load_inception,
+)
 from agents.evaluation.set_encoder import SHIPPED, SetEncoder
+from agents.evaluation.set_network import blurred
 from benchmarks.set_encoder_training import SetEncoderTraining, damage, train_set_encoder
 from scene_envs.datasets import to_union
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError

@@ -9,8 +9,7 @@ import torch
 
 from agents.cli.commands.evaluate import choose_measures
 from agents.evaluation import grammar_scenes
-from agents.evaluation.measures import MEASURES, EvaluationInputs, compute_measure
-from agents.evaluation.real_scenes import RealScenes
+from agents.evaluation.measure import MEASURES, EvaluationInputs, RealScenes, compute_measure
 from scene_envs.datasets import SceneDataset, generate
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from agents.evaluation import grammar_scenes
-from agents.evaluation.render_classifier import class_images, render_classifier_accuracy
-from agents.evaluation.two_sample_test import ClassifierConfig
+from agents.evaluation.classifier import ClassifierConfig
+from agents.evaluation.pictures import class_images, render_classifier_accuracy
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.render import render
 from scene_envs.render.stage import get_stage

@@ -18,10 +18,19 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
-from scene_envs.export import AssetFiles, export, formats, list_formats, register_format
-from scene_envs.export.asset_files import Palette, face_colors, textured_mesh, visual_mesh
-from scene_envs.export.formats import get_format
-from scene_envs.export.placed import angle_axis, exact_rotations, identifiers, quaternion
+from scene_envs.export import AssetFiles, export, list_formats, register_format
+from scene_envs.export import api as formats
+from scene_envs.export.api import get_format
+from scene_envs.export.placed import (
+    Palette,
+    angle_axis,
+    exact_rotations,
+    face_colors,
+    identifiers,
+    quaternion,
+    textured_mesh,
+    visual_mesh,
+)
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
 from tests.helpers.export_scenes import DIMSUM, laid_scene

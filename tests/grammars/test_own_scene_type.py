@@ -12,12 +12,13 @@ import pytest
 import torch
 
 from agents.cli import main
-from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
+from agents.pretraining.settings import PretrainConfig
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, check_reward, resolve_reward
-from scene_envs import SceneBatch, get_scene_type, list_scene_types, plugins
+from scene_envs import SceneBatch, get_scene_type, list_scene_types
+from scene_envs import registry as plugins
 from scene_envs.datasets import SceneDataset, generate, judge_scenes, parse_prompt, scene_facts
 from scene_envs.errors import UnknownNameError
 from scene_envs.export import export
@@ -42,7 +43,7 @@ def tea_house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def _ranges_of_a_tenth() -> Iterator[None]:
     """Ranges come from a tenth of the objects, as those of built-in grammars in ``tests/conftest.py``."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scene_envs.datasets.ranges._OBJECTS", 1000)
+        patch.setattr("scene_envs.datasets.generate._OBJECTS", 1000)
         yield
 
 

@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from scene_envs.grammars import get_grammar
-from scene_envs.grammars.pantry_shelf import FRUIT
-from scene_envs.grammars.shelf import TIER_HEIGHTS
+from scene_envs.grammars.shelf import FRUIT, TIER_HEIGHTS
 from scene_envs.scene_types import get_scene_type
 from tests.helpers.drawn_scenes import Thing, apart, check_physics, check_slots, contents_of, counts, every, things_of
 

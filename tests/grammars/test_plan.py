@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.assets import get_library
 from scene_envs.assets.shapes import box, ring, solid
-from scene_envs.grammars.plan import Disc, Placed, Rectangle, _top_on_axis, carrying_height, meet, plan_of
+from scene_envs.grammars.surface import Disc, Placed, Rectangle, _top_on_axis, carrying_height, meet, plan_of
 
 ASSETS = ("dinner_plate", "serving_dish", "teacup", "teapot", "steamer_bottom")
 

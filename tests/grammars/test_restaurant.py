@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from scene_envs.datasets import judge_scenes
 from scene_envs.grammars import get_grammar
-from scene_envs.grammars.containers import Containers
 from scene_envs.grammars.dimsum_table import STEP
 from scene_envs.grammars.dsl import Geometric, Repeat, Stack
+from scene_envs.grammars.layout import Containers
 from scene_envs.grammars.restaurant import stack_of_three, tables
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type

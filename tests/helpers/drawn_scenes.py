@@ -9,9 +9,9 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.datasets.verification import judge_scenes
+from scene_envs.datasets.shards import judge_scenes
 from scene_envs.grammars import Grammar
-from scene_envs.grammars.containers import Containers
+from scene_envs.grammars.layout import Containers
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 

@@ -15,7 +15,8 @@ import tomllib
 from agents.networks import list_networks
 from agents.planning import list_planners
 from agents.post_training import list_algorithms
-from scene_envs import list_scene_types, plugins
+from scene_envs import list_scene_types
+from scene_envs import registry as plugins
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "extending"
 

@@ -29,7 +29,7 @@ def train(runs: Iterable[Run]) -> None:
         torch.set_default_dtype(dtype)
         hook = register_module_forward_pre_hook(lambda module, inputs: tuple(map(_as_default, inputs)))
         try:
-            with patch("matplotlib.figure.Figure.savefig"), patch("agents.post_training.sample_check._CLASSIFIERS", 1):
+            with patch("matplotlib.figure.Figure.savefig"), patch("agents.post_training.guard._CLASSIFIERS", 1):
                 post_train(config, prior=tiny_prior(process=process, text=config.prompt is not None).to(dtype))
         finally:
             hook.remove()

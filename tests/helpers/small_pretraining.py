@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from agents.pretraining.config import PretrainConfig
-from agents.pretraining.data import SceneTable
-from agents.pretraining.initial_prior import build_prior
+from agents.pretraining.initial_prior import SceneTable, build_prior
+from agents.pretraining.settings import PretrainConfig
 from agents.pretraining.trainer import Pretrainer
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch

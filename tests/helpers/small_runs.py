@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from agents.configuration import changed
+from agents.configuration.composition import changed
 from agents.post_training import PostTrainConfig
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, StepTable
-from agents.diffusion.schedules import make_schedule
+from agents.diffusion.gaussian import make_schedule
 from agents.post_training import DenoisingPolicy
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior

@@ -10,10 +10,10 @@ import torch
 from safetensors.torch import load_file
 
 from agents import PretrainConfig
+from agents.configuration.prior_names import SHIPPED, list_priors
 from agents.networks import MixedFlux, MixedFluxConfig, build_network, network_config
 from agents.networks.flux_modules import ObservedFlagsConfig
 from agents.networks.geometry import ContactsConfig, RelationsConfig
-from agents.prior_names import SHIPPED, list_priors
 from agents.priors.prior import ScenePrior
 from scene_envs.errors import InvalidInputError, UnknownNameError
 

@@ -10,8 +10,7 @@ import torch
 
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import furniture_overlap, penetration
-from scene_envs.physics.correction import corrections
-from scene_envs.physics.falls import falls
+from scene_envs.physics.correction import corrections, falls
 from scene_envs.physics.motion import physics_of
 from scene_envs.physics.placement import flatten
 from scene_envs.scene import SceneBatch

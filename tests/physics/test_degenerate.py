@@ -13,11 +13,11 @@ from rewards import evaluate_reward, make_reward
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
-from scene_envs.physics.batches import run_kernel, spent, stack
-from scene_envs.physics.budget import MAX_PER_OBJECT, MIN_UNITS, PER_OBJECT, PER_PAIR, PER_SCENE
+from scene_envs.physics.api import run_kernel, spent, stack
+from scene_envs.physics.placement import MAX_PER_OBJECT, MIN_UNITS, PER_OBJECT, PER_PAIR, PER_SCENE
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
-from scene_envs.scene_types.built_in import BUILT_IN
+from scene_envs.scene_types.registry import BUILT_IN
 
 pytestmark = pytest.mark.slow
 

@@ -24,10 +24,10 @@ from scene_envs.physics import (
     project,
     settle,
 )
+from scene_envs.physics.bullet import World
 from scene_envs.physics.motion import Physics, physics_of
 from scene_envs.physics.placement import Objects
-from scene_envs.physics.rest import Rest
-from scene_envs.physics.world import World
+from scene_envs.physics.statics import Rest
 from scene_envs.scene import SceneBatch
 from tests.helpers.simple_scenes import SIDE, TYPE, scene, turned
 

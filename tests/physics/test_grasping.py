@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
-from scene_envs.physics.budget import Budget
 from scene_envs.physics.grasping import Gripper, _hand, reachable
-from scene_envs.physics.placement import flatten
+from scene_envs.physics.placement import Budget, flatten
 from scene_envs.scene import SceneBatch
 from tests.helpers.simple_scenes import SIDE, scene
 

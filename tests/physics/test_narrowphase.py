@@ -13,9 +13,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from benchmarks.narrowphase import minkowski_depth, sample
-from scene_envs.physics.features import PartFeatures
-from scene_envs.physics.narrowphase import PenetrationDepth
-from scene_envs.physics.separation import PlacedParts
+from scene_envs.physics.collision import PenetrationDepth
+from scene_envs.physics.parts import PartFeatures
+from scene_envs.physics.placement import PlacedParts
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,9 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.assets import get_library
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import penetration, planes, project, projection
-from scene_envs.physics.budget import Budget
+from scene_envs.physics import penetration, project, projection
+from scene_envs.physics import projection as planes
+from scene_envs.physics.placement import Budget
 from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
 from tests.helpers.simple_scenes import SIDE

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from rewards.verdicts import forget_verdicts
+from rewards.feasible import forget_verdicts
 from scene_envs.envs.scoring import RewardScorer
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar

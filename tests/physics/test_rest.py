@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import FeasibilityResult, equilibrium, feasibility, make_ready, settle
+from scene_envs.physics.bullet import World
 from scene_envs.physics.motion import Physics, physics_of
-from scene_envs.physics.pairs import ObjectPairs
-from scene_envs.physics.placement import Objects
-from scene_envs.physics.rest import Rest
-from scene_envs.physics.world import World
+from scene_envs.physics.placement import ObjectPairs, Objects
+from scene_envs.physics.statics import Rest
 from scene_envs.scene import SceneBatch
 from tests.helpers.simple_scenes import SIDE, scene, turned
 

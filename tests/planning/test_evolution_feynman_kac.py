@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from agents.planning import EvolutionPlanner, FeynmanKacPlanner, GreedyPlanner
+from agents.planning.evolution import spliced
 from agents.planning.feynman_kac import Particles, systematic
-from agents.planning.splice import spliced
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext
 from scene_envs.errors import InvalidInputError

@@ -19,13 +19,13 @@ from agents.planning import (
     UCTPlanner,
     run_search,
 )
-from agents.planning.journal import _described
+from agents.planning.session import _described
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput
-from rewards.category_count import CategoryCount
-from rewards.local_files import allow_local_rewards
+from rewards.counts import CategoryCount
 from rewards.process import IsolatedReward
+from rewards.registry import allow_local_rewards
 from scene_envs.datasets import generate
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar

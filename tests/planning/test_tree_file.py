@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from agents.planning import SearchOutcome, SearchRecord, list_planners, run_search
-from agents.planning.tree_page import MAX_OTHER_SCENES, MAX_PATH_SCENES, _cards, shown_nodes, write_tree_page
+from agents.planning.output import MAX_OTHER_SCENES, MAX_PATH_SCENES, _cards, shown_nodes, write_tree_page
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput
 from scene_envs.envs import SearchState

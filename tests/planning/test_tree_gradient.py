@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, StepTable
-from agents.diffusion.schedules import make_schedule
+from agents.diffusion.gaussian import make_schedule
 from agents.planning import EvolutionPlanner, GradientPlanner
-from agents.planning.guidance import Guidance, overlap
-from agents.planning.registry import planner_settings
+from agents.planning.gradient import Guidance, overlap
+from agents.planning.ledger import planner_settings
 from agents.priors.testing import tiny_prior
 from scene_envs.envs import SearchEnv
 from scene_envs.errors import InvalidInputError, SceneEnvsError

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from agents.post_training import scene_bank
+from agents.post_training import real_scenes as scene_bank
 from agents.priors.prior import ScenePrior
 from scene_envs.scene import SceneBatch
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from agents.post_training import post_train
-from agents.post_training.discriminative import DiscriminativeLoss
+from agents.post_training.regularisation import DiscriminativeLoss
 from agents.post_training.trainer import PostTrainer
 from agents.priors.prior import NoisedScenes, ScenePrior
 from agents.priors.testing import tiny_prior

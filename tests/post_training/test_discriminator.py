@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from agents import post_train
-from agents.post_training import learned_rewards
+from agents.post_training import learner as learned_rewards
 from agents.post_training.discriminator import Discriminator
 from agents.priors.testing import tiny_prior
 from rewards import allow_local_rewards, check_reward, learned_parts, resolve_reward

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.configuration import changed
+from agents.configuration.composition import changed
 from agents.post_training import learner as learner_module
 from agents.post_training import post_train
 from agents.post_training.run_files import SCENES_NAME

@@ -9,8 +9,7 @@ from scipy.optimize import brentq
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from agents.post_training.forward_losses import AWMLoss, NFTLoss
-from agents.post_training.forward_process_loss import ForwardProcessLoss
+from agents.post_training.algorithms.forward_process import AWMLoss, ForwardProcessLoss, NFTLoss
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError

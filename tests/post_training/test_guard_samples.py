@@ -11,11 +11,10 @@ import torch
 from agents.evaluation import tallest_stacks
 from agents.evaluation.metrics import count_wasserstein
 from agents.post_training import post_train
-from agents.post_training.config import GuardSettings
-from agents.post_training.forward_process import ForwardProcess
-from agents.post_training.guard import Guard
-from agents.post_training.guard_report import guard_sections, guard_verdict
-from agents.post_training.sample_check import beyond
+from agents.post_training.algorithms.forward_process import ForwardProcess
+from agents.post_training.guard import Guard, beyond
+from agents.post_training.report import guard_sections, guard_verdict
+from agents.post_training.settings import GuardSettings
 from agents.post_training.trainer import PostTrainer
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
@@ -30,7 +29,7 @@ SAMPLES = {"guard.scenes": 20, "guard.samples": 20, "guard.samples_every": 2, "b
 @pytest.fixture(autouse=True)
 def _one_classifier(monkeypatch: pytest.MonkeyPatch) -> None:
     """A figure of samples comes from one classifier and not from the mean of three."""
-    monkeypatch.setattr("agents.post_training.sample_check._CLASSIFIERS", 1)
+    monkeypatch.setattr("agents.post_training.guard._CLASSIFIERS", 1)
 
 
 def trainer(path: Path, **changes: object) -> PostTrainer:

@@ -14,7 +14,7 @@ from torch import Generator
 
 from agents import ScenePrior
 from agents.post_training import GuidanceDistillationLoss, PostTrainer
-from agents.post_training.guidance_distillation import GuidanceDistillation
+from agents.post_training.algorithms.guidance_distillation import GuidanceDistillation
 from agents.priors.guidance import position_std
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError

@@ -12,12 +12,10 @@ import pytest
 import torch
 
 from agents.cli.keys import compose
-from agents.configuration import changed
+from agents.configuration.composition import changed
 from agents.post_training import PostTrainConfig, post_train, post_train_and_compare
-from agents.post_training.algorithms import algorithm_settings
-from agents.post_training.hold import HIGHEST, LOWEST, HoldState, adjust
 from agents.post_training.regularisation import Regularisation
-from agents.post_training.regularisation_settings import RegularisationSettings
+from agents.post_training.settings import HIGHEST, LOWEST, HoldState, RegularisationSettings, adjust, algorithm_settings
 from agents.post_training.trainer import PostTrainer
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import SceneEnvsError
@@ -156,7 +154,7 @@ def test_a_killed_run_goes_on_with_the_weight_it_had(tmp_path: Path, hold: str, 
 def test_a_target_that_cannot_be_held_is_said_in_log_metrics_and_report(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("agents.post_training.hold.HIGHEST", 1.1)
+    monkeypatch.setattr("agents.post_training.settings.HIGHEST", 1.1)
     config = _run(tmp_path, "ddpo_sf", regularisation__hold="guard:1.001", guard__every=1, optimizer__lr=0.05)
     with caplog.at_level(logging.WARNING):
         metrics = post_train_and_compare(config, scenes=2, num_steps=2, prior=tiny_prior(slots=6))

@@ -13,12 +13,12 @@ import torch
 from PIL import Image
 from rich.console import Console
 
-from agents.post_training import learned_rewards, post_train_and_compare
-from agents.post_training.comparison_run import load_learned_rewards
-from agents.post_training.curves import draw_curve
+from agents.post_training import learner as learned_rewards
+from agents.post_training import post_train_and_compare
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
-from agents.post_training.report import Page, Picture, Section, Tile, write_report
+from agents.post_training.report import Page, Picture, Section, Tile, load_learned_rewards, write_report
+from agents.post_training.run_files import draw_curve
 from agents.post_training.trainer import post_train
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.configuration import changed
+from agents.configuration.composition import changed
 from agents.post_training import PostTrainer, post_train
 from agents.post_training import regularisation as regularisation_module
 from agents.priors.prior import ScenePrior

@@ -17,8 +17,7 @@ from agents.post_training import (
     post_train_and_compare,
 )
 from agents.post_training.doctor import diagnose
-from agents.post_training.prompts import PromptDeck
-from agents.post_training.rollouts import collect, text_of
+from agents.post_training.rollouts import PromptDeck, collect, text_of
 from agents.priors.mixed import MixedPrior
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior

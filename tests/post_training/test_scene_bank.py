@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.post_training.scene_bank import _DRAWN, real_scenes
+from agents.post_training.real_scenes import _DRAWN, real_scenes
 from agents.priors.testing import tiny_prior
 from scene_envs.grammars import get_grammar
 

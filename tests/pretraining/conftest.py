@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from agents.pretraining.config import PretrainConfig
+from agents.pretraining.settings import PretrainConfig
 from scene_envs.scene import SceneBatch
 
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from agents.cli import main
-from agents.pretraining.config import PretrainConfig
-from agents.pretraining.data import SceneTable
+from agents.pretraining.initial_prior import SceneTable
+from agents.pretraining.settings import PretrainConfig
 from agents.pretraining.setup import prepare
 from agents.pretraining.trainer import Pretrainer
 from agents.priors.prior import ScenePrior

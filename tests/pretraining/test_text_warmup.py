@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from agents.configuration import changed as changed_config
-from agents.pretraining.config import PretrainConfig
-from agents.pretraining.data import SceneTable
-from agents.pretraining.initial_prior import build_prior
+from agents.configuration.composition import changed as changed_config
+from agents.pretraining.initial_prior import SceneTable, build_prior
+from agents.pretraining.settings import PretrainConfig
 from agents.pretraining.text_warmup import warm_up_text
 from agents.priors.mixed import MixedPrior
 from scene_envs.datasets.prompts import describe_all

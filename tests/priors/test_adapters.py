@@ -16,7 +16,7 @@ from agents.priors import ScenePrior
 from agents.priors.card import card_page
 from agents.priors.files import PriorFacts
 from agents.priors.testing import tiny_prior
-from scene_envs.envs.resolvers import resolve_prior
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
 from tests.helpers.small_runs import small_config
 

@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 
 from agents.cli import main
 from agents.diffusion import StepTable
-from agents.pretraining.config import PretrainConfig
+from agents.pretraining.settings import PretrainConfig
 from agents.pretraining.trainer import pretrain
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior

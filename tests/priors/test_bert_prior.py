@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from agents.configuration import changed
+from agents.configuration.composition import changed
 from agents.networks.text_encoders import FOLDER_VARIABLE, load_bert
-from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
+from agents.pretraining.settings import PretrainConfig
 from agents.pretraining.trainer import pretrain
 from agents.priors.card import package_prior
 from agents.priors.checkpoint_import import import_checkpoint

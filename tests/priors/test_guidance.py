@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from agents import ScenePrior
-from agents.prior_names import list_priors
+from agents.configuration.prior_names import list_priors
 from agents.priors.card import package_prior
 from agents.priors.files import read_config
 from agents.priors.guidance import NumberGuidance, PhysicsGuidance, kind_weights, number_bounds

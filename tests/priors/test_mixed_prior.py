@@ -13,9 +13,8 @@ from agents.diffusion import MixedStep
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.denoisers import Observed
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
-from agents.post_training.algorithm_settings import DDPOSFSettings, NFTSettings
-from agents.post_training.algorithms import make_algorithm
 from agents.post_training.rollouts import collect
+from agents.post_training.settings import DDPOSFSettings, NFTSettings, make_algorithm
 from agents.priors.mixed import MixedPrior
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior

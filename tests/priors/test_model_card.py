@@ -9,7 +9,7 @@ import pytest
 
 from agents import PretrainConfig
 from agents.cli import main
-from agents.configuration import config_text
+from agents.configuration.composition import config_text
 from agents.priors.card import OWN_LICENSE, package_prior, prior_digest, read_measures
 from agents.priors.files import PriorFacts
 from agents.priors.prior import ScenePrior

@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from agents.prior_names import SHIPPED, list_priors
+from agents.configuration.prior_names import SHIPPED, list_priors
 from agents.priors.files import PriorFacts, to_precision
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior

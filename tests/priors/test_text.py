@@ -11,8 +11,8 @@ import torch
 
 from agents.networks import MixedFluxConfig, TextConfig, TextEncoder
 from agents.networks.text import number_features, vocabulary
-from agents.pretraining.config import PretrainConfig
 from agents.pretraining.initial_prior import build_prior
+from agents.pretraining.settings import PretrainConfig
 from agents.priors.config import MixedPriorConfig
 from agents.priors.mixed import MixedPrior
 from agents.priors.prior import ScenePrior

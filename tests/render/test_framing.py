@@ -9,9 +9,9 @@ from scene_envs.datasets import to_union
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar
 from scene_envs.render import picture_camera
-from scene_envs.render.cameras import light_camera
-from scene_envs.render.framing import fit_camera, frame_scene_type, scene_type_of_one
-from scene_envs.scene_types import Camera, FixedObject, SceneType, built_in, get_scene_type, union_scene_type
+from scene_envs.render.stage import fit_camera, frame_scene_type, light_camera, scene_type_of_one
+from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type, union_scene_type
+from scene_envs.scene_types import registry as built_in
 
 BUILT_IN = [scene_type.name for scene_type in built_in.BUILT_IN]
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scene_envs.render.lighting import camera_points, contact_shade, soft_shadow, surface_normals
-from scene_envs.render.stage import Frame
+from scene_envs.render.stage import Frame, camera_points, contact_shade, soft_shadow, surface_normals
 
 
 def looking_down(height, depth):

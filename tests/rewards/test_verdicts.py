@@ -8,7 +8,7 @@ import torch
 
 import scene_envs.physics as physics
 from rewards import FeasibleObjects, FeasibleShare, RewardContext, Stability, WeightedSum
-from rewards.verdicts import forget_verdicts, verdicts
+from rewards.feasible import forget_verdicts, verdicts
 from scene_envs import SceneBatch, get_grammar
 
 LIMITS = {"max_penetration": 1e-3, "max_displacement": 1e-3, "max_rotation": 1e-2, "duration": 0.1}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.pretraining.log import TrainingLog
+from agents.pretraining.trainer import TrainingLog
 from agents.utils.loggers import LOGGERS, make_logger
 from scene_envs.errors import MissingDependencyError, UnknownNameError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from agents.configuration import named
+from agents.configuration.composition import named
 
 WRITES = False
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from agents.configuration import DeviceKeys, ProgressKeys
+from agents.configuration.composition import DeviceKeys, ProgressKeys
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -28,8 +28,8 @@ class DemoConfig(DeviceKeys, ProgressKeys):
 
 def run(settings: DemoConfig, run: Run) -> None:
     """Post-train twice, compare, report."""
-    from agents.post_training.comparison import number_rows
     from agents.post_training.demo import RUNS, run_demo
+    from agents.post_training.report import number_rows
 
     metrics = run_demo(**vars(settings))
     for label, *cells in number_rows({name: metrics[name] for name in ("base", *RUNS)}):

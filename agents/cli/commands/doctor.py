@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from agents.post_training.config import PostTrainConfig
+from agents.post_training.settings import PostTrainConfig
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run

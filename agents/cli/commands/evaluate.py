@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration import MEASURE_NAMES, OutputKeys
+from agents.configuration.composition import MEASURE_NAMES, OutputKeys
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, unknown_name
 
 if TYPE_CHECKING:
@@ -134,8 +134,7 @@ def check(settings: EvaluateConfig) -> None:
 
 def run(settings: EvaluateConfig, run: Run) -> None:
     """Sample, measure group by group, tabulate."""
-    from agents.evaluation.measures import EvaluationInputs, compute_measure
-    from agents.evaluation.real_scenes import RealScenes
+    from agents.evaluation.measure import EvaluationInputs, RealScenes, compute_measure
     from agents.priors.prior import ScenePrior
     from scene_envs.files import write_text
     from scene_envs.physics import PhysicsPool
@@ -303,7 +302,7 @@ class _Results:
 
     def report(self, groups: list[str]) -> str:
         """The figures of ``groups`` as Markdown, and the groups that were not measured."""
-        from agents.evaluation.report import figure_table
+        from agents.evaluation.measure import figure_table
 
         self.write()
         measured = {k: v for name in groups for k, v in self.groups.get(name, {}).items() if v is not None}

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import make_ready
-from agents.configuration import DrawKeys
+from agents.configuration.composition import DrawKeys
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 
@@ -53,7 +53,7 @@ class ExportConfig(DrawKeys):
 
 def check(settings: ExportConfig) -> None:
     """Refuse impossible settings before scenes are read."""
-    from scene_envs.export.formats import check_formats
+    from scene_envs.export.api import check_formats
 
     if bool(settings.scenes) == bool(settings.prior):
         raise InvalidInputError(
@@ -65,7 +65,7 @@ def check(settings: ExportConfig) -> None:
 
 def run(settings: ExportConfig, run: Run) -> None:
     """Read or draw the scenes and write them."""
-    from scene_envs.export.formats import resolve_formats
+    from scene_envs.export.api import resolve_formats
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 

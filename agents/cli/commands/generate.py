@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration import ProgressKeys, named, require_one_of
+from agents.configuration.composition import ProgressKeys, named, require_one_of
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from agents.configuration import DeviceKeys, named
+from agents.configuration.composition import DeviceKeys, named
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:

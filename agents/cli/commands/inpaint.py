@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import draw_scenes
-from agents.configuration import DeviceKeys
+from agents.configuration.composition import DeviceKeys
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 

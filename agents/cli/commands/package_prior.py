@@ -44,7 +44,7 @@ class PackagePriorConfig:
 
 def check(settings: PackagePriorConfig) -> None:
     """Refuse impossible settings before the prior is read."""
-    from agents.configuration import require_one_of
+    from agents.configuration.composition import require_one_of
 
     if not settings.prior or not settings.output:
         raise InvalidInputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from agents.post_training.config import PostTrainConfig
+from agents.post_training.settings import PostTrainConfig
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run

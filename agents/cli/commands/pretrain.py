@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from agents.pretraining.config import PretrainConfig
+from agents.pretraining.settings import PretrainConfig
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run

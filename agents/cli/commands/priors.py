@@ -21,7 +21,7 @@ class PriorsConfig:
 
 def run(settings: PriorsConfig) -> None:
     """Print every shipped prior with its size and its figures, or one card."""
-    from agents.prior_names import find_prior, list_priors
+    from agents.configuration.prior_names import find_prior, list_priors
     from agents.priors.card import README
     from agents.priors.files import PriorFacts
 

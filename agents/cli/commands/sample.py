@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.export import export_scenes
 from agents.cli.commands.scenes import draw_scenes, make_ready, reward_figures
-from agents.configuration import OutputKeys, SamplingKeys, named, require_one_of
+from agents.configuration.composition import OutputKeys, SamplingKeys, named, require_one_of
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class SampleConfig(SamplingKeys, OutputKeys):
 
 def check(settings: SampleConfig) -> None:
     """Refuse impossible settings before a prior is loaded."""
-    from scene_envs.export.formats import check_formats
+    from scene_envs.export.api import check_formats
 
     require_one_of(settings, "union", ("one_type", "any"))
     if settings.export is not None:
@@ -61,7 +61,7 @@ def run(settings: SampleConfig, run: Run) -> None:
     from agents.priors.guidance import physics_strength
     from agents.priors.prior import ScenePrior
     from rewards.process import close_reward, run_reward
-    from scene_envs.export.formats import resolve_formats
+    from scene_envs.export.api import resolve_formats
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration import DeviceKeys, ProgressKeys, RewardLimits, composed, named
-from agents.planning.config import SearchConfig
+from agents.configuration.composition import DeviceKeys, ProgressKeys, RewardLimits, composed, named
+from agents.planning.settings import SearchConfig
 from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:

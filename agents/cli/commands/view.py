@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration import DrawKeys, named
+from agents.configuration.composition import DrawKeys, named
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import find_scenes, is_dataset, load_scenes
 

@@ -2,30 +2,364 @@
 
 from __future__ import annotations
 
+import colorsys
 import dataclasses
-from collections.abc import Sequence
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scene_envs.arrays import Array
-from scene_envs.assets.base import Asset, ConvexPart, bounds_of
-from scene_envs.assets.importing.entries import AssetEntry, Axis
-from scene_envs.assets.importing.hulls import enclosing_hull, thickness
-from scene_envs.assets.importing.inertials import weigh
+from scene_envs.assets.base import Asset, ConvexPart, bounds_of, regular_plural
 from scene_envs.assets.importing.limits import seconds_left
-from scene_envs.assets.importing.model import Inertial, Model, Shape, merged_inertial, pose_of
-from scene_envs.assets.importing.report import AssetReport
-from scene_envs.assets.importing.sdf import read_sdf
-from scene_envs.assets.importing.solids import collision_of, meshes_of, visual_of
-from scene_envs.assets.importing.urdf import read_urdf
-from scene_envs.assets.shapes import mass_properties
-from scene_envs.assets.surfaces import join
-from scene_envs.errors import InvalidInputError
+from scene_envs.assets.importing.mesh_files import (
+    MESH_SUFFIXES,
+    Color,
+    Inertial,
+    Model,
+    Shape,
+    merged_inertial,
+    pose_of,
+)
+from scene_envs.assets.importing.robot_files import read_sdf, read_urdf
+from scene_envs.assets.importing.solids import (
+    METHODS,
+    Method,
+    collision_of,
+    enclosing_hull,
+    meshes_of,
+    thickness,
+    visual_of,
+)
+from scene_envs.assets.shapes import MassProperties, join, mass_properties
+from scene_envs.errors import CorruptFileError, InvalidInputError
 
 if TYPE_CHECKING:
     import trimesh
+
+
+YAML_NAMES = ("library.yaml", "library.yml")
+SUFFIXES = (".urdf", ".sdf", *MESH_SUFFIXES)
+"""Files that can become assets."""
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+AXES: tuple[Axis, ...] = ("x", "y", "z", "-x", "-y", "-z")
+Base = Literal["bottom", "origin"]
+BASES: tuple[Base, ...] = ("bottom", "origin")
+
+
+@dataclass(frozen=True)
+class AssetNames:
+    """File and names of an asset.
+
+    Attributes:
+        file: Path relative to the folder.
+        name: Identifier; the stem of the file by default.
+        display_name: Name in prompts; the identifier with spaces by default.
+        plural: Plural of the display name; the regular one by default.
+    """
+
+    file: str
+    name: str = ""
+    display_name: str = ""
+    plural: str = ""
+
+
+@dataclass(frozen=True)
+class AssetEntry(AssetNames):
+    """One asset of a library: its names and how its file becomes a body.
+
+    Attributes:
+        scale: Factor on all lengths; a file in millimetres needs 0.001.
+        density: Density (kg/m^3) of the evenly filled shape.
+        mass: Mass, kg.
+        welded: Whether the asset is fixed to the world; the file decides by default.
+        up: Axis of the file that points up.
+        color: Class colour (r, g, b), also used for surfaces without a colour.
+        base: ``"bottom"`` puts the frame under the middle of the bounding box, ``"origin"`` leaves it.
+        decomposition: ``"auto"``, ``"coacd"`` or ``"convex"``; see :func:`convex_parts`.
+        concavity: CoACD's threshold, 0.01 (many parts) to 1 (one).
+    """
+
+    scale: float = 1.0
+    density: float | None = None
+    mass: float | None = None
+    welded: bool | None = None
+    up: Axis = "z"
+    color: Color | None = None
+    base: Base = "bottom"
+    decomposition: Method = "auto"
+    concavity: float = 0.05
+
+
+_TEXTS = ("file", "name", "display_name", "plural")
+_NUMBERS = ("scale", "density", "mass", "concavity")
+_CHOICES: Mapping[str, tuple[str, ...]] = {"up": AXES, "base": BASES, "decomposition": METHODS}
+
+
+def read_entries(path: Path) -> list[AssetEntry]:
+    """The entries of a YAML file: a list of mappings, one per asset.
+
+    Raises:
+        CorruptFileError: not YAML; the line is named.
+        InvalidInputError: an unknown key (the nearest known one is offered), a value that cannot be, a file
+            that does not exist, or a name that appears twice.
+    """
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CorruptFileError(f"{path} is not well-formed YAML: {' '.join(str(error).split())}") from error
+    except OSError as error:
+        raise CorruptFileError(f"{path} cannot be read: {error.strerror or error}") from error
+    if not isinstance(content, list) or not content:
+        raise InvalidInputError(f"{path} must be a list of assets, each beginning with `- file: ...`")
+    entries = [_entry(item, f"{path}, asset {index}", path.parent) for index, item in enumerate(content, start=1)]
+    check_names(entries, str(path))
+    return entries
+
+
+def check_names(entries: list[AssetEntry], where: str) -> None:
+    """Raise InvalidInputError when two entries have the same name."""
+    files: dict[str, str] = {}
+    for entry in entries:
+        if entry.name in files:
+            raise InvalidInputError(
+                f"{where}: {files[entry.name]!r} and {entry.file!r} are both called {entry.name!r}; "
+                "give one of them another `name`"
+            )
+        files[entry.name] = entry.file
+
+
+def default_entry(file: str) -> AssetEntry:
+    """The entry of a file for which the user gives no settings."""
+    path = Path(file)
+    stem = path.parent.name if path.stem.lower() == "model" and path.parent.name else path.stem
+    return _named({"file": file, "name": "_".join(stem.split())})
+
+
+def _named(values: dict[str, Any]) -> AssetEntry:
+    file = Path(values["file"])
+    values.setdefault("name", "_".join(file.stem.split()))
+    values.setdefault("display_name", " ".join(values["name"].replace("_", " ").split()) or values["name"])
+    values.setdefault("plural", regular_plural(values["display_name"]))
+    values.setdefault("up", "z")
+    return AssetEntry(**values)
+
+
+def _entry(item: Any, where: str, folder: Path) -> AssetEntry:
+    if not isinstance(item, Mapping):
+        raise InvalidInputError(f"{where} must be a mapping such as `file: mug.urdf`, got {item!r}")
+    known = [field.name for field in fields(AssetEntry)]
+    for key in item:
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.4)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise InvalidInputError(f"{where}: unknown key {key!r}{hint} Known: {', '.join(known)}.")
+    if not isinstance(item.get("file"), str) or not item["file"]:
+        raise InvalidInputError(f"{where} needs a `file`")
+    where = f"{where} ({item['file']})"
+    path = folder / item["file"]
+    if path.suffix.lower() not in SUFFIXES:
+        raise InvalidInputError(f"{where}: files of type {path.suffix!r} cannot be read; known: {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise InvalidInputError(f"{where}: there is no such file in {folder}")
+    values = {key: _value(key, value, where) for key, value in item.items() if value is not None}
+    if "mass" in values and "density" in values:
+        raise InvalidInputError(f"{where}: give mass or density, not both")
+    if values.get("welded") and ("mass" in values or "density" in values):
+        raise InvalidInputError(f"{where}: a welded asset has no mass; drop `mass` and `density`, or `welded`")
+    return _named(values)
+
+
+def _value(key: str, value: Any, where: str) -> Any:
+    if key in _TEXTS:
+        if not isinstance(value, str) or not value.strip():
+            raise InvalidInputError(f"{where}: {key} must be text, got {value!r}; put it in quotes")
+        return value.strip()
+    if key in _NUMBERS:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not math.isfinite(value) or value <= 0:
+            raise InvalidInputError(f"{where}: {key} must be a number above 0, got {value!r}")
+        return float(value)
+    if key in _CHOICES:
+        if value not in _CHOICES[key]:
+            raise InvalidInputError(f"{where}: {key} must be one of {', '.join(_CHOICES[key])}, got {value!r}")
+        return value
+    if key == "welded":
+        if not isinstance(value, bool):
+            raise InvalidInputError(f"{where}: welded must be true or false, got {value!r}")
+        return value
+    return _color(value, where)
+
+
+def _color(value: Any, where: str) -> Color:
+    """(r, g, b) from a list of three integers, or from "#rrggbb"."""
+    if isinstance(value, str) and value.startswith("#") and len(value) == 7:
+        try:
+            return (int(value[1:3], 16), int(value[3:5], 16), int(value[5:7], 16))
+        except ValueError:
+            pass
+    is_list = isinstance(value, list) and len(value) == 3
+    if is_list and all(isinstance(v, int) and not isinstance(v, bool) and 0 <= v <= 255 for v in value):
+        return (value[0], value[1], value[2])
+    raise InvalidInputError(f"{where}: color must be [r, g, b] in 0..255 or '#rrggbb', got {value!r}")
+
+
+DEFAULT_DENSITY = 500.0
+"""Density (kg/m^3) used where neither the file nor the user gives one: wood, or a ceramic vessel with its air."""
+_POSSIBLE = (1.0, 23_000.0)
+"""Possible densities, kg/m^3, from air to osmium."""
+_FACTOR = 10.0
+"""Largest factor between a moment of inertia and that of the same shape filled evenly."""
+
+
+class Weight(NamedTuple):
+    """Mass properties of an asset, with remarks for the report."""
+
+    properties: MassProperties
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def weigh(
+    given: Inertial | None,
+    parts: Sequence[ConvexPart],
+    volume: float,
+    *,
+    mass: float | None = None,
+    density: float | None = None,
+) -> Weight:
+    """Mass properties of an asset.
+
+    The file's properties are kept when they can belong to a body of this shape. A user's ``mass`` keeps the
+    file's distribution of mass; a user's ``density`` fills the shape evenly.
+
+    Args:
+        given: Inertial of the file; None when the file has none.
+        parts: Fine convex parts, m.
+        volume: Volume of the shape, m^3.
+        mass: The user's mass, kg.
+        density: The user's density, kg/m^3.
+    """
+    if density is not None:
+        return Weight(mass_properties(parts, density * volume), (), ())
+    if given is None or given.mass <= 0:
+        known = density_note = ""
+        if mass is None:
+            known, density_note = "mass and inertia", f" at {DEFAULT_DENSITY:g} kg/m^3"
+            mass = DEFAULT_DENSITY * volume
+        else:
+            known = "inertia"
+        why = "the file gives none" if given is None else f"the file gives a mass of {given.mass:g} kg"
+        return Weight(mass_properties(parts, mass), (f"{known} computed from the shape{density_note}: {why}",), ())
+    if mass is None:
+        low, high = _POSSIBLE
+        found = given.mass / volume
+        if not low <= found <= high:
+            mass = DEFAULT_DENSITY * volume
+            reason = f"the file's {given.mass:g} kg would be {found:.3g} kg/m^3"
+            text = f"mass and inertia recomputed at {DEFAULT_DENSITY:g} kg/m^3: {reason}"
+            return Weight(mass_properties(parts, mass), (), (text,))
+        mass = given.mass
+    computed = mass_properties(parts, mass)
+    inertia = given.inertia * (mass / given.mass)
+    wrong = why_impossible(inertia, given.center_of_mass, parts, computed)
+    if wrong:
+        return Weight(computed, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
+    return Weight(MassProperties(mass, given.center_of_mass, 0.5 * (inertia + inertia.T)), (), ())
+
+
+def why_impossible(inertia: Array, center: Array, parts: Sequence[ConvexPart], computed: MassProperties) -> str:
+    """Reason why a body of this shape cannot have this inertia (3, 3) and centre of mass (3,); empty if possible.
+
+    >>> from scene_envs.assets.shapes import box
+    >>> cube = [box((0.1, 0.1, 0.1))]
+    >>> why_impossible(np.eye(3), np.zeros(3), cube, mass_properties(cube, 1.0))
+    'the inertia, moments (1, 1, 1) kg m^2, is 600 times that of the shape'
+    """
+    moments = np.linalg.eigvalsh(0.5 * (inertia + inertia.T))
+    shown = f"the inertia, moments ({', '.join(f'{m:.3g}' for m in moments)}) kg m^2,"
+    if moments[0] <= 0:
+        return f"{shown} is not positive"
+    if moments[2] > (moments[0] + moments[1]) * (1.0 + 1e-4):
+        return f"{shown} breaks the triangle inequality"
+    expected = np.linalg.eigvalsh(computed.inertia)
+    ratio = moments / expected
+    worst = ratio[np.abs(np.log(ratio)).argmax()]
+    if not 1.0 / _FACTOR <= worst <= _FACTOR:
+        return f"{shown} is {worst:.3g} times that of the shape"
+    low, high = bounds_of(parts)
+    margin = 1e-3 * np.linalg.norm(high - low)
+    if (center < low - margin).any() or (center > high + margin).any():
+        return f"the centre of mass ({', '.join(f'{c:.3g}' for c in center)}) m lies outside the shape"
+    return ""
+
+
+@dataclass(frozen=True)
+class AssetReport:
+    """Import report of one file.
+
+    Attributes:
+        name: Name of the asset.
+        file: File that the asset was read from.
+        mass: Mass, kg; 0 for welded assets.
+        density: Density of the solid, kg/m^3; 0 for welded assets.
+        parts: Number of fine convex parts.
+        origin: Position (x, y, z) of the origin of the file in the asset frame, m.
+        notes: Assumptions and choices.
+        warnings: Faults of the file, corrected where possible.
+        error: Reason why there is no asset; empty when there is one.
+    """
+
+    name: str
+    file: Path
+    mass: float = 0.0
+    density: float = 0.0
+    parts: int = 0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    error: str = ""
+
+    def __str__(self) -> str:
+        if self.error:
+            return f"{self.name}: not imported: {self.error}"
+        weight = f"{self.mass:.4g} kg" if self.mass > 0 else "welded"
+        pieces = f"{self.parts} convex part{'s' if self.parts != 1 else ''}"
+        return "; ".join([f"{self.name}: {self.file.name}, {weight}, {pieces}", *self.warnings, *self.notes])
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """Import report of a folder.
+
+    Attributes:
+        folder: Folder that was read.
+        assets: One report per file.
+        notes: Notes about the folder as a whole.
+    """
+
+    folder: Path
+    assets: tuple[AssetReport, ...]
+    notes: tuple[str, ...] = ()
+
+    def __getitem__(self, name: str) -> AssetReport:
+        """The report of the asset called ``name``; KeyError without one."""
+        for report in self.assets:
+            if report.name == name:
+                return report
+        raise KeyError(name)
+
+    def __str__(self) -> str:
+        return "\n".join([f"{self.folder}: {len(self.assets)} assets", *self.notes, *map(str, self.assets)])
+
 
 _CONVEX = 0.01
 """Depth below the hull, as a fraction of the diagonal, up to which a body counts as convex."""
@@ -218,3 +552,32 @@ def _moved(mesh: trimesh.Trimesh, shift: Array) -> trimesh.Trimesh:
         vertex_colors=mesh.visual.vertex_colors,  # type: ignore[union-attr]
         process=False,
     )
+
+
+@cache
+def _candidates() -> NDArray[np.float64]:
+    tones = [(s, v) for v in (0.85, 0.6, 0.4) for s in (0.85, 0.55)]
+    colors = [colorsys.hsv_to_rgb(hue / 36.0, s, v) for s, v in tones for hue in range(36)]
+    return np.rint(255.0 * np.array(colors))
+
+
+def distinct_colors(count: int, taken: Iterable[Color] = ()) -> list[Color]:
+    """``count`` colours, each the candidate farthest from white and from all before it; the choice is deterministic.
+
+    >>> colors = np.array(distinct_colors(20), dtype=float)
+    >>> gaps = np.linalg.norm(colors[:, None] - colors[None], axis=-1) + 1e3 * np.eye(20)
+    >>> bool(gaps.min() > 60)
+    True
+    """
+    pool = _candidates()
+    gaps = np.full(len(pool), np.inf)
+    for color in ((255, 255, 255), *taken):
+        gaps = np.minimum(gaps, np.linalg.norm(pool - np.asarray(color), axis=1))
+    chosen: list[Color] = []
+    while len(chosen) < count:
+        if gaps.max() < 1.0:  # every candidate is taken: begin again
+            gaps = np.full(len(pool), np.inf)
+        red, green, blue = pool[int(gaps.argmax())].astype(int).tolist()
+        chosen.append((red, green, blue))
+        gaps = np.minimum(gaps, np.linalg.norm(pool - (red, green, blue), axis=1))
+    return chosen

@@ -2,20 +2,98 @@
 
 from __future__ import annotations
 
+import os
+import re
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
 from scene_envs.assets.importing.limits import check_file, check_triangles, seconds_left
-from scene_envs.assets.importing.model import Color
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, SceneEnvsError
 
 if TYPE_CHECKING:
     import trimesh
+
+
+Color = tuple[int, int, int]
+Kind = Literal["mesh", "box", "cylinder", "sphere", "capsule", "ellipsoid"]
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One piece of geometry of a model.
+
+    The ``size`` (m) is (x, y, z) of a box, (radius, length along z without the caps) of a cylinder or capsule,
+    (radius,) of a sphere, (x, y, z radii) of an ellipsoid; of a mesh, it is the scale (x, y, z).
+    """
+
+    kind: Kind
+    size: tuple[float, ...]
+    pose: Array  # (4, 4) transform from the shape frame to the model frame
+    where: str  # link and element, for messages
+    path: Path | None = None  # file of a mesh
+    color: Color | None = None  # colour (r, g, b) given by the model, or None
+    is_convex: bool = False  # whether the model declares the mesh convex
+
+
+@dataclass(frozen=True, eq=False)
+class Inertial:
+    """Mass (kg), centre of mass (3,) m and inertia (3, 3) kg m^2 about that centre, model axes."""
+
+    mass: float
+    center_of_mass: Array
+    inertia: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A model file at zero joint positions, in one frame."""
+
+    visuals: tuple[Shape, ...]  # shapes to draw
+    collisions: tuple[Shape, ...]  # shapes for collisions
+    inertials: tuple[Inertial, ...] = ()  # inertials of the links that have one
+    static: bool | None = None  # whether the model is fixed to the world; None when the file does not say
+    notes: tuple[str, ...] = field(default=())  # choices of the reader that the file may not intend
+
+
+def pose_of(translation: Array, rotation: Array) -> Array:
+    """(4, 4) from a translation (3,) m and a rotation (3, 3)."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, translation
+    return pose
+
+
+def from_roll_pitch_yaw(angles: Array) -> Array:
+    """(3, 3) rotation of URDF and SDF: about the fixed axes x, then y, then z; (3,) rad."""
+    return np.asarray(Rotation.from_euler("xyz", angles).as_matrix())
+
+
+def moved_inertial(pose: Array, inertial: Inertial) -> Inertial:
+    """The inertial of a link in the frame that ``pose`` (4, 4) maps to."""
+    turn = pose[:3, :3]
+    return Inertial(
+        inertial.mass, turn @ inertial.center_of_mass + pose[:3, 3], turn @ inertial.inertia @ turn.T
+    )  # fmt: skip
+
+
+def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
+    """The inertial of several bodies joined to one: masses add, inertias by the parallel-axis theorem."""
+    mass = sum(inertial.mass for inertial in inertials)
+    weights = [inertial.mass / mass if mass > 0 else 1.0 / len(inertials) for inertial in inertials]
+    center = sum((w * i.center_of_mass for w, i in zip(weights, inertials, strict=True)), np.zeros(3))
+    total = np.zeros((3, 3))
+    for inertial in inertials:
+        arm = inertial.center_of_mass - center
+        total += inertial.inertia + inertial.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return Inertial(mass, center, total)
+
 
 MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 """Mesh files that can be read."""
@@ -259,3 +337,100 @@ def _corner_normals(mesh: trimesh.Trimesh) -> Array:
     length = np.linalg.norm(total, axis=1, keepdims=True)
     smooth = np.divide(total, length, out=own.copy(), where=length > 0)
     return smooth.reshape(-1, 3, 3)
+
+
+_PREFIXED = re.compile(rb"(</?)([A-Za-z_][\w.-]*):([A-Za-z_][\w.-]*)")
+"""An element with a namespace prefix, such as <drake:declare_convex/>."""
+
+
+def read_xml(path: Path) -> Element:
+    """The root element of an XML file; prefixes that are never declared are tolerated.
+
+    Raises:
+        CorruptFileError: the file cannot be read or is not XML; the line is named.
+        InvalidInputError: the file is larger than imports may be.
+    """
+    check_file(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CorruptFileError(f"{path} cannot be read: {error.strerror or error}") from error
+    try:
+        return ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        if "unbound prefix" in str(error):
+            try:
+                return ElementTree.fromstring(_PREFIXED.sub(rb"\1\2.\3", data))
+            except ElementTree.ParseError as other:
+                error = other
+        raise CorruptFileError(f"{path} is not well-formed XML: {error}") from error
+
+
+def numbers(text: str | None, count: int, path: Path, where: str, default: tuple[float, ...] | None = None) -> Array:
+    """``count`` finite numbers from text; ``default`` when there is none.
+
+    Raises:
+        CorruptFileError: the text is anything else; file and place are named.
+    """
+    if text is None or not text.strip():
+        if default is None:
+            raise CorruptFileError(f"{path}: {where} is missing; it needs {count} number{'s' if count > 1 else ''}")
+        return np.array(default, dtype=np.float64)
+    try:
+        values = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        hint = "; expand it with xacro first" if "$" in text else ""
+        raise CorruptFileError(f"{path}: {where} is {text.strip()!r}, which is not numbers{hint}") from None
+    if len(values) != count or not np.isfinite(values).all():
+        raise CorruptFileError(f"{path}: {where} must be {count} finite number(s), got {text.strip()!r}")
+    return values
+
+
+def positive(text: str | None, count: int, path: Path, where: str) -> tuple[float, ...]:
+    """``count`` numbers above 0; raises CorruptFileError otherwise."""
+    values = numbers(text, count, path, where)
+    if not (values > 0).all():
+        raise CorruptFileError(f"{path}: {where} must be above 0, got {text!r}")
+    return tuple(values.tolist())
+
+
+def color_of(text: str | None, path: Path, where: str) -> Color | None:
+    """(r, g, b) in 0..255 from "r g b a" in 0..1; None without text."""
+    if text is None:
+        return None
+    values = numbers(text, len(text.split()), path, where)
+    if len(values) < 3:
+        raise CorruptFileError(f"{path}: {where} must be r g b [a] in 0..1, got {text!r}")
+    red, green, blue = np.rint(255.0 * np.clip(values[:3], 0.0, 1.0)).astype(int).tolist()
+    return (red, green, blue)
+
+
+def find_mesh(uri: str, path: Path, where: str) -> Path:
+    """The file that ``uri`` names in the model at ``path``: relative, absolute, file://, package:// or model://.
+
+    A package is searched among the folders above the model, and in ``ROS_PACKAGE_PATH``.
+
+    Raises:
+        InvalidInputError: there is no such file; the places that were searched are named.
+    """
+    text = uri.strip()
+    scheme, separator, rest = text.partition("://")
+    if not separator:
+        scheme, rest = "", text
+    rest = rest.replace("\\", "/")
+    folder = path.parent
+    candidates = [Path(rest)] if scheme == "file" else [folder / rest]
+    if scheme in ("package", "model"):
+        package, _, inside = rest.partition("/")
+        for parent in (folder, *folder.parents):
+            candidates += [parent / rest, parent / inside] if parent.name == package else [parent / rest]
+        roots = filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep))
+        candidates += [candidate for root in roots for candidate in (Path(root) / rest, Path(root) / inside)]
+        candidates.append(folder / inside)
+    elif scheme not in ("", "file"):
+        raise InvalidInputError(f"{path}: {where} refers to {uri!r}; only files, package:// and model:// can be read")
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate.resolve()
+    more = ", the folders above it or ROS_PACKAGE_PATH" if scheme in ("package", "model") else ""
+    raise InvalidInputError(f"{path}: {where} refers to the mesh {uri!r}, which does not exist in {folder}{more}")

@@ -13,13 +13,15 @@ from xml.etree import ElementTree
 
 from scene_envs.assets.base import Asset, AssetLibrary
 from scene_envs.assets.built_in import class_colors
-from scene_envs.assets.importing.class_colors import distinct_colors
-from scene_envs.assets.importing.entries import (
+from scene_envs.assets.importing.build import (
     SUFFIXES,
     YAML_NAMES,
     AssetEntry,
+    AssetReport,
+    ImportReport,
     check_names,
     default_entry,
+    distinct_colors,
     read_entries,
 )
 from scene_envs.assets.importing.limits import (
@@ -31,8 +33,7 @@ from scene_envs.assets.importing.limits import (
     timed,
     too_slow,
 )
-from scene_envs.assets.importing.model import Color
-from scene_envs.assets.importing.report import AssetReport, ImportReport
+from scene_envs.assets.importing.mesh_files import Color
 from scene_envs.errors import InvalidInputError, SceneEnvsError, unknown_name
 from scene_envs.workers import WorkerFailure, run_apart
 

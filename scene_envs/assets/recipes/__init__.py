@@ -1,33 +1,5 @@
-"""Recipes of all built-in assets, which are registered by an import of this package."""
+"""The recipes; importing this package registers them all."""
 
-from scene_envs.assets.recipes import (
-    bowls,
-    breakfast_ware,
-    cutlery,
-    drinks,
-    fruit,
-    furniture,
-    games,
-    groceries,
-    plates,
-    shelf,
-    steamers,
-    teaware,
-    toys,
-)
+from scene_envs.assets.recipes import breakfast_ware, food, furniture, tableware, toys
 
-__all__ = [
-    "bowls",
-    "breakfast_ware",
-    "cutlery",
-    "drinks",
-    "fruit",
-    "furniture",
-    "games",
-    "groceries",
-    "plates",
-    "shelf",
-    "steamers",
-    "teaware",
-    "toys",
-]
+__all__ = ["breakfast_ware", "food", "furniture", "tableware", "toys"]

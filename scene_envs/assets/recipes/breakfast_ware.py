@@ -4,15 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import trimesh
 
 from scene_envs.arrays import Array
-from scene_envs.assets.recipe import Model, asset_recipe
+from scene_envs.assets.base import ConvexPart, Model, asset_recipe
 from scene_envs.assets.recipes.painted import Cells, revolve
-from scene_envs.assets.shapes import hull_of, ring, rods, solid
-from scene_envs.assets.surfaces import Color, arc, join, lathe, tube
+from scene_envs.assets.shapes import (
+    Color,
+    arc,
+    circle,
+    convex_hull,
+    fan,
+    hull_of,
+    join,
+    lathe,
+    loft,
+    quad_faces,
+    ring,
+    rods,
+    solid,
+    surface,
+    tube,
+)
 
 _SIDES = 12
 _WHITE: Color = (246, 245, 240)
@@ -165,3 +181,151 @@ def utensil_crock() -> Model:
     )  # fmt: skip
     parts = [floor, *wall]
     return Model(visual, parts, parts)
+
+
+_STEEL: Color = (196, 200, 207)
+_BRIGHT: Color = (222, 226, 231)
+_SHADE: Color = (168, 173, 182)
+_THICK = 0.0034
+"""Thickness of the metal, m; thinner metal would vanish when engines shrink hulls by 1 mm."""
+
+Station = tuple[float, float, float, float]
+"""(x, width, lowest z, highest z) of a section across the length, m."""
+
+
+def _section(station: Station, y: float = 0.0) -> Array:
+    x, width, low, high = station
+    return np.array([[x, y + side * width, z] for side in (-0.5, 0.5) for z in (low, high)])
+
+
+def _beam(stations: Sequence[Station], y: float = 0.0) -> list[ConvexPart]:
+    """One part between each two neighbouring stations; they share their end faces."""
+    return [convex_hull(np.concatenate([_section(a, y), _section(b, y)])) for a, b in pairwise(stations)]
+
+
+def _grip(end: Station) -> list[Station]:
+    """Stations that round the end of a handle off, seen from above."""
+    x, width, low, high = end
+    return [
+        (x + along * width, across * width, low, high) for along, across in ((0.0, 0.45), (0.06, 0.72), (0.2, 0.94))
+    ]
+
+
+def _skin(stations: Sequence[Station], color: Color, y: float = 0.0, samples: int = 14) -> trimesh.Trimesh:
+    """A rounded bar through the stations, y = 0 in its middle."""
+    from scipy.interpolate import PchipInterpolator
+
+    table = np.array(stations)
+    x = np.unique([*np.linspace(table[0, 0], table[-1, 0], samples), *table[:, 0]])
+    width, low, high = PchipInterpolator(table[:, 0], table[:, 1:])(x).T
+    angles = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False) + np.pi / 12
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ring = np.sign(ring) * np.abs(ring) ** 0.6  # between an ellipse and a rectangle
+    ring /= np.abs(ring).max(axis=0)
+    sides = y + 0.5 * width[:, None] * ring[:, 0]
+    heights = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * ring[:, 1]
+    return loft(np.stack([np.broadcast_to(x[:, None], sides.shape), sides, heights], axis=-1), color)
+
+
+@asset_recipe("fork", display_name="fork", mass=0.03, color=(92, 108, 132))
+def fork() -> Model:
+    """A fork with three tines, 0.19 m long."""
+    end: Station = (-0.095, 0.017, 0.0, _THICK)
+    waist: Station = (-0.035, 0.011, 0.0, _THICK)
+    neck: Station = (0.030, 0.008, 0.012 - _THICK, 0.012)
+    foot, root = (0.046, 0.025, 0.0, 0.0036), (0.058, 0.025, 0.0, 0.0036)
+    tip = (0.095, 0.0036, 0.0028, 0.0062)
+    handle, stem = _beam([end, waist, neck])
+    head = convex_hull(np.concatenate([_section(neck), _section(foot), _section(root)]))
+    rows = (-0.0102, 0.0, 0.0102)
+    tines = [_beam([(root[0], 0.0046, 0.0, 0.0036), tip], y)[0] for y in rows]
+    shoulder = (0.040, 0.020, 0.0035, 0.0078)
+    visual = join(
+        _skin([*_grip(end), (-0.07, 0.016, 0.0, _THICK), waist, (0.0, 0.008, 0.0042, 0.0076), neck], _STEEL),
+        _skin([neck, shoulder, (0.047, 0.0248, 0.0006, 0.0042), root], _STEEL, samples=8),
+        *(
+            _skin([(root[0], 0.0046, 0.0, 0.0036), (0.078, 0.0042, 0.0004, 0.0036), tip], _BRIGHT, y, samples=5)
+            for y in rows
+        ),
+    )
+    return Model(visual, [handle, stem, head, *tines], [hull_of([handle, stem]), hull_of([head, *tines])])
+
+
+@asset_recipe("knife", display_name="knife", plural="knives", mass=0.05, color=(58, 70, 92))
+def knife() -> Model:
+    """A table knife lying on its side, 0.22 m long; the edge of the blade faces -y."""
+    end, bolster = (-0.110, 0.018, 0.0, 0.008), (-0.005, 0.014, 0.0, 0.0065)
+    outline = np.array([(-0.005, -0.0068), (0.045, -0.0100), (0.080, -0.0098), (0.100, -0.0060), (0.110, 0.0035),
+                        (0.108, 0.0085), (0.090, 0.0100), (-0.005, 0.0068)])  # fmt: skip
+    handle = _beam([end, bolster])[0]
+    blade = convex_hull([(x, y, z) for x, y in outline for z in (0.0, _THICK)])
+    edge = _rounded(outline - np.array([[0.012, 0.0]]) * (outline[:, :1] < 0.0))  # starts inside the handle
+    ground = edge + np.where(edge[:, 1:] < 0.0, [[0.0, 0.0028]], [[0.0, 0.0]])  # the bevel along the cutting edge
+    low, high, flat = (
+        np.column_stack([line, np.full(len(line), z)]) for line, z in ((edge, 0.0), (edge, 0.0012), (ground, 0.0024))
+    )
+    visual = join(
+        _skin([*_grip(end), (-0.100, 0.0177, 0.0, 0.008), (-0.03, 0.0145, 0.0, 0.0072), bolster], _STEEL),
+        _prism(low, high, _SHADE),
+        _prism(high, flat, _BRIGHT),
+    )
+    return Model(visual, [handle, blade], [hull_of([handle, blade])])
+
+
+def _prism(low: Array, high: Array, color: Color) -> trimesh.Trimesh:
+    """A sharp-edged skin between two outlines (K, 3), counter-clockwise from above, with its lid."""
+    count = len(low)
+    quads = np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1)
+    sides = surface(quads.reshape(-1, 3), quad_faces(count), color)
+    return join(sides, surface(high, fan(count), color), surface(low, fan(count)[:, ::-1], color))
+
+
+def _rounded(outline: Array, rounds: int = 2) -> Array:
+    """A closed outline (K, 2) with its corners cut off ``rounds`` times (Chaikin); it stays inside the first one."""
+    for _ in range(rounds):
+        ahead = np.roll(outline, -1, axis=0)
+        outline = np.stack([0.8 * outline + 0.2 * ahead, 0.2 * outline + 0.8 * ahead], axis=1).reshape(-1, 2)
+    return outline
+
+
+@asset_recipe("dinner_spoon", display_name="spoon", mass=0.035, color=(128, 150, 178))
+def dinner_spoon() -> Model:
+    """A table spoon, 0.19 m long."""
+    return _spoon(0.19, 0.042, 0.015)
+
+
+@asset_recipe("teaspoon", display_name="spoon", mass=0.02, color=(168, 190, 214))
+def teaspoon() -> Model:
+    """A small spoon, 0.155 m long."""
+    return _spoon(0.155, 0.032, 0.013)
+
+
+def _spoon(length: float, width: float, height: float) -> Model:
+    """Handle, stem and a bowl that is filled for physics; all sizes in m."""
+    half, reach, front = 0.5 * length, 0.34 * length, 0.60 * height
+    end = (-half, 0.40 * width, 0.0, _THICK)
+    waist = (-0.20 * length, 0.26 * width, 0.0, _THICK)
+    neck = (half - reach, 0.18 * width, height - _THICK, height)
+    handle, stem = _beam([end, waist, neck])
+    center, size = half - 0.5 * reach, np.array([0.5 * reach, 0.5 * width])
+
+    def at(outline: Array, scale: float, drop: float) -> Array:
+        """Outline (K, 2) in the unit circle to (K, 3): ``drop`` 0 is the sloping rim, 1 the table."""
+        flat = np.array([center, 0.0]) + scale * outline * size
+        rim = height - (height - front) * (flat[:, 0] - (half - reach)) / reach
+        return np.column_stack([flat, rim * (1.0 - drop)])
+
+    bowl = convex_hull(np.concatenate([_section(neck), at(circle(12), 1.0, 0.0), at(circle(8), 0.45, 1.0)]))
+    shell = ((0.45, 1.0), (0.70, 0.80), (0.88, 0.50), (0.97, 0.2), (1.0, 0.0))
+    dish = ((0.94, 0.0), (0.86, 0.26), (0.66, 0.53), (0.4, 0.66), (0.05, 0.7))
+    outside, inside = ([at(circle(24), scale, drop) for scale, drop in steps] for steps in (shell, dish))
+    hold: Station = (-0.42 * length, 0.38 * width, 0.0, _THICK)
+    arch: Station = (0.0, 0.19 * width, 0.3 * height, 0.3 * height + _THICK)
+    rim: Station = (neck[0] + 0.004, 0.22 * width, height - _THICK, height)
+    visual = join(
+        _skin([*_grip(end), hold, waist, arch, neck, rim], _STEEL),
+        loft(outside, _STEEL, caps=(True, False)),
+        loft([outside[-1], inside[0]], _BRIGHT, caps=(False, False)),
+        loft(inside, _SHADE, caps=(False, True)),
+    )
+    return Model(visual, [handle, stem, bowl], [hull_of([handle, stem]), bowl])

@@ -9,8 +9,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from scene_envs.arrays import Array
-from scene_envs.assets.shapes import Profile, circle
-from scene_envs.assets.surfaces import Color, arc, fan, join, quad_faces, surface
+from scene_envs.assets.shapes import Color, Profile, arc, circle, fan, join, quad_faces, surface
 
 Cells = NDArray[np.int64]
 """Indices into the colours of a surface, one per cell."""
@@ -38,7 +37,7 @@ def revolve(
 
     Args:
         profile: (P, 2) points (r, z), m, with the outside on the right, as for
-            :func:`~scene_envs.assets.surfaces.lathe`.
+            :func:`~scene_envs.assets.shapes.lathe`.
         colors: Colours that ``paint`` chooses from.
         paint: Function from angle and height of the middle of a cell to the index of its colour.
         segments: Number of cells around the axis.

@@ -1,0 +1,688 @@
+"""Configuration: nested dataclasses checked by type, and their values from registries and files by Hydra."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import functools
+import inspect
+import math
+import re
+import sys
+import types
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from importlib.util import find_spec
+from pathlib import Path
+from types import NoneType
+from typing import Any, ClassVar, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from agents.utils.loggers import LOGGERS
+from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.registry import load_plugins, plugin_entry_points
+
+Config = TypeVar("Config")
+Kind = TypeVar("Kind", bound=type)
+
+_WANTED: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
+PROGRESS_STYLES = ("bar", "lines", "none")
+"""How progress is shown, as in :data:`scene_envs.progress.STYLES`."""
+
+
+# Checks of single values
+
+
+def require_at_least(settings: Any, low: float, *names: str) -> None:
+    """Refuse numbers below ``low``, and NaN; None is accepted."""
+    for name in names:
+        if getattr(settings, name) is not None and not getattr(settings, name) >= low:
+            raise InvalidInputError(f"{name}={getattr(settings, name)} must be at least {low}")
+
+
+def require_positive(settings: Any, *names: str) -> None:
+    """Refuse numbers that are not positive."""
+    for name in names:
+        if not getattr(settings, name) > 0:
+            raise InvalidInputError(f"{name}={getattr(settings, name)} must be positive")
+
+
+def require_finite(settings: Any, *names: str) -> None:
+    """Refuse infinite numbers and NaN."""
+    for name in names:
+        if not math.isfinite(getattr(settings, name)):
+            raise InvalidInputError(f"{name}={getattr(settings, name)} must be a finite number")
+
+
+def require_unit_interval(settings: Any, *names: str) -> None:
+    """Refuse numbers outside 0 to 1."""
+    for name in names:
+        if not 0 <= getattr(settings, name) <= 1:
+            raise InvalidInputError(f"{name}={getattr(settings, name)} is outside 0..1: it is a share")
+
+
+def require_one_of(settings: Any, name: str, known: Sequence[str], what: str = "") -> None:
+    """Refuse a word that is not in ``known``; the message calls it ``what`` and offers the nearest known word."""
+    if getattr(settings, name) not in known:
+        raise unknown_name(what or name, str(getattr(settings, name)), known)
+
+
+def check_types(kind: type, values: Mapping[str, Any]) -> None:
+    """Refuse values of the wrong type for the fields of a dataclass that are numbers, texts or booleans.
+
+    Raises:
+        InvalidInputError: a value of another type; names the field.
+
+    >>> from dataclasses import make_dataclass
+    >>> check_types(make_dataclass("Size", [("depth", int)]), {"depth": "deep"})
+    Traceback (most recent call last):
+    scene_envs.errors.InvalidInputError: depth='deep' must be of type int
+    """
+    for name, wanted in get_type_hints(kind).items():
+        plain = set(get_args(wanted) if get_origin(wanted) in (Union, types.UnionType) else (wanted,))
+        if name not in values or not plain <= {int, float, str, bool, NoneType}:
+            continue
+        value = values[name]
+        fits = any(type(value) is one or (one is float and type(value) is int) for one in plain)
+        if not fits or (isinstance(value, float) and not math.isfinite(value)):
+            told = " or ".join(sorted("null" if one is NoneType else one.__name__ for one in plain))
+            raise InvalidInputError(f"{name}={str(value)[:100]!r} must be of type {told}")
+
+
+# Dataclasses from nested mappings and back
+
+
+def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: str = "") -> Config:
+    """An instance of the dataclass ``kind`` from a nested mapping; missing keys keep their defaults.
+
+    Args:
+        kind: a dataclass, whose groups are dataclasses as well.
+        tree: values by field name.
+        path: where ``tree`` stands, for messages, such as ``"optimizer."``.
+        command: whose keys these are, for messages.
+
+    Raises:
+        UnknownNameError: a key that ``kind`` does not have; the nearest one is offered.
+        InvalidInputError: a value is not of the type of its key.
+    """
+    values = field_values(kind, tree, path, command)
+    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
+        if field.init and field.name not in values:
+            values[field.name] = default_of(field)
+    return kind(**values)
+
+
+def field_values(kind: type, tree: Mapping[str, Any], path: str = "", command: str = "") -> dict[str, Any]:
+    """The values of ``tree``, converted to the types of the fields of ``kind``."""
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    hints = get_type_hints(kind)
+    values = {}
+    for key, value in tree.items():
+        if key not in fields:
+            known = [path + name for name in fields]
+            raise unknown_name(f"{command} key".strip(), path + str(key), known)
+        values[key] = convert(fields[key], hints[key], value, path + key, command)
+    return values
+
+
+def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, command: str = "") -> Any:
+    """``value``, converted for a field of type ``hint``."""
+    if field.metadata.get("named"):
+        if isinstance(value, int | float):
+            raise InvalidInputError(
+                f"{path}={as_command_line_text(value)[:60]} is neither a name nor a mapping with a name"
+            )
+        alone = isinstance(value, Mapping) and set(value) == {"name"}
+        return value["name"] if alone else _plain(value)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            return value
+        if not isinstance(value, Mapping):
+            keys = ", ".join(f"{path}.{inner.name}" for inner in dataclasses.fields(hint))
+            raise InvalidInputError(
+                f"{path}={as_command_line_text(value)}: {path} is a group of keys; give one of {keys}"
+            )
+        return build(kind_of(field, hint, value), value, f"{path}.", command)
+    return _scalar(hint, value, path)
+
+
+def kind_of(field: dataclasses.Field[Any], hint: type, value: Mapping[str, Any]) -> type:
+    """The dataclass of a group's settings, which its ``name`` decides where components are registered."""
+    find: Callable[[str], type] | None = field.metadata.get("kinds")
+    if find is None:
+        return hint
+    return find(value["name"] if "name" in value else default_of(field).name)
+
+
+def default_of(field: dataclasses.Field[Any]) -> Any:
+    """The default of a field, a new one where there is a factory."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return None if field.default is dataclasses.MISSING else field.default
+
+
+def parts_of(kind: type) -> dict[type, list[dataclasses.Field[Any]]]:
+    """Fields of a dataclass by the class that declares them first, its own before those of the classes it extends.
+
+    >>> @dataclasses.dataclass
+    ... class Seeded:
+    ...     seed: int = 0
+    >>> @dataclasses.dataclass
+    ... class Draw(Seeded):
+    ...     count: int = 1
+    >>> {part.__name__: [field.name for field in fields] for part, fields in parts_of(Draw).items()}
+    {'Draw': ['count'], 'Seeded': ['seed']}
+    """
+    first = {name: part for part in kind.__mro__ for name in inspect.get_annotations(part)}
+    parts: dict[type, list[dataclasses.Field[Any]]] = {part: [] for part in kind.__mro__}
+    for field in dataclasses.fields(kind):
+        parts[first[field.name]].append(field)
+    return {part: fields for part, fields in parts.items() if fields}
+
+
+def changed(config: Config, changes: Mapping[str, Any]) -> Config:
+    """A copy of a config with some values changed, by dotted key.
+
+    >>> from dataclasses import dataclass, field
+    >>> @dataclass
+    ... class Inner:
+    ...     size: int = 1
+    >>> @dataclass
+    ... class Outer:
+    ...     inner: Inner = field(default_factory=Inner)
+    >>> changed(Outer(), {"inner.size": 3})
+    Outer(inner=Inner(size=3))
+    """
+    groups: dict[str, dict[str, Any]] = {}
+    values: dict[str, Any] = {}
+    known = {field.name for field in dataclasses.fields(config)}  # type: ignore[arg-type]
+    for key, value in changes.items():
+        head, dot, rest = key.partition(".")
+        if head not in known:
+            raise unknown_name("key", key, dotted_keys(config))
+        if dot:
+            groups.setdefault(head, {})[rest] = value
+        else:
+            values[head] = value
+    nested = {name: changed(values.get(name, getattr(config, name)), inner) for name, inner in groups.items()}
+    return dataclasses.replace(config, **{**values, **nested})  # type: ignore[type-var]
+
+
+def dotted_keys(config: Any) -> list[str]:
+    """All keys of a config; a key of a group stands behind the name of the group and a dot."""
+    return list(dotted_values(config))
+
+
+def dotted_values(config: Any) -> dict[str, Any]:
+    """All values of a config by :func:`dotted_keys`."""
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        inner = dotted_values(value) if dataclasses.is_dataclass(value) else None
+        values |= {field.name: value} if inner is None else {f"{field.name}.{key}": item for key, item in inner.items()}
+    return values
+
+
+def dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one flat mapping with dotted keys.
+
+    >>> dotted({"optimizer": {"lr": 0.1}, "seed": 0})
+    {'optimizer.lr': 0.1, 'seed': 0}
+    """
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
+    return flat
+
+
+def plain_tree(config: Any) -> dict[str, Any]:
+    """A config as nested mappings of numbers, strings and lists, its keys in the order of :func:`parts_of`."""
+    tree = _plain(config)
+    return {field.name: tree[field.name] for part in parts_of(type(config)).values() for field in part}
+
+
+def config_text(values: Any) -> str:
+    """All keys as the ``config.yaml`` that ``--config`` reads; of a config, or of a nested mapping."""
+    import yaml
+
+    return yaml.safe_dump(plain_tree(values) if dataclasses.is_dataclass(values) else _plain(values), sort_keys=False)
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _scalar(hint: Any, value: Any, path: str) -> Any:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return _plain(value)
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        options = [option for option in arguments if option is not type(None)]
+        for option in sorted(options, key=lambda option: option is str):  # a list of texts before a text
+            with contextlib.suppress(InvalidInputError):
+                return _scalar(option, value, path)
+        wanted = " or ".join(map(_wanted, options))
+        raise InvalidInputError(
+            f"{path}={as_command_line_text(value)} is not {wanted}{' or null' * (type(None) in arguments)}"
+        )
+    if origin in (list, tuple):
+        if not isinstance(value, list | tuple):
+            _refuse(hint, value, path)
+        return origin(_scalar(arguments[0], item, path) for item in value) if arguments else origin(value)
+    if origin is dict:
+        return _plain(value) if isinstance(value, Mapping) else _refuse(hint, value, path)
+    if hint is float and isinstance(value, int | float | str) and not isinstance(value, bool):
+        try:
+            return float(value)  # YAML reads 1e-4 as a text
+        except (ValueError, OverflowError):
+            _refuse(hint, value, path)
+    if hint is str and isinstance(value, int | float) and not isinstance(value, bool):
+        return str(value)
+    if hint is int and isinstance(value, int) and abs(value) >= 2**63:
+        raise InvalidInputError(f"{path} is a number of {len(str(abs(value)))} digits; whole numbers end at 2^63")
+    right = isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
+    return value if right else _refuse(hint, value, path)
+
+
+def _refuse(hint: Any, value: Any, path: str) -> Any:
+    raise InvalidInputError(f"{path}={as_command_line_text(value)[:300]} is not {_wanted(hint)}")
+
+
+def _wanted(hint: Any) -> str:
+    if get_origin(hint) in (list, tuple):
+        inner = {int: "whole numbers", float: "numbers", str: "texts"}.get((*get_args(hint), Any)[0], "values")
+        return f"a list of {inner}"
+    if get_origin(hint) is dict:
+        return "a mapping, as {key: value}"
+    return _WANTED.get(hint, str(hint))
+
+
+def as_command_line_text(value: Any) -> str:
+    """A value as it would be typed on the command line."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, list | tuple):
+        return ",".join(map(as_command_line_text, value))
+    if dataclasses.is_dataclass(value):
+        return f"{{{', '.join(f'{key}: {as_command_line_text(item)}' for key, item in vars(value).items())}}}"
+    return str(value)
+
+
+# Groups, their options, and recipes
+
+
+def nested(
+    make: Callable[[], Any],
+    *,
+    folder: str = "",
+    option: str = "",
+    kinds: Callable[[str], type] | None = None,
+    registered: Callable[[], Iterable[str]] = tuple,
+) -> Any:
+    """A field that is a group of keys, a dataclass.
+
+    Args:
+        make: function that makes the default.
+        folder: name of the group of options in Hydra; empty where there is nothing to choose.
+        option: option that is the default.
+        kinds: function from the name of a component to the dataclass of its settings; None where all have the same.
+        registered: function that lists the registered components; with a mapping, its values are their settings.
+    """
+    metadata = {"folder": folder, "option": option, "kinds": kinds, "registered": registered}
+    return dataclasses.field(default_factory=make, metadata=metadata)
+
+
+def named(default: Any, folder: str) -> Any:
+    """A field that names a component, or is a mapping with its ``name`` and settings.
+
+    Args:
+        default: name of the default component, or None.
+        folder: name of the group of options in Hydra: ``reward``, ``mask`` or ``scene``.
+    """
+    return dataclasses.field(
+        default=default, metadata={"folder": folder, "named": True, "registered": _REGISTERED[folder]}
+    )
+
+
+def known_rewards() -> list[str]:
+    """Names of rewards, as :func:`rewards.list_rewards`; reads the sources, as the package imports torch."""
+    if "rewards.registry" in sys.modules:
+        from rewards import list_rewards
+
+        return list_rewards()
+    folder = Path(str(getattr(find_spec("rewards"), "origin", ""))).parent
+    texts = [file.read_text(encoding="utf-8") for file in folder.glob("*.py")]
+    own = {name for text in texts for name in re.findall(r'^@register_reward\("(\w+)"\)', text, flags=re.MULTILINE)}
+    return sorted({*own, *plugin_entry_points("scene_envs.rewards")})
+
+
+def known_masks() -> list[str]:
+    """Names of mask generators, as :func:`scene_envs.list_masks`; imports no torch."""
+    if "scene_envs.envs.masks" in sys.modules:
+        from scene_envs.envs.masks import list_masks
+
+        return list_masks()
+    from scene_envs.envs.settings import MASKS
+
+    return sorted({*MASKS, *plugin_entry_points("scene_envs.masks")})
+
+
+def known_scenes() -> list[str]:
+    """Names of scene types; imports the modules of installed packages that register more."""
+    from scene_envs.scene_types import list_scene_types
+
+    if plugin_entry_points("scene_envs.grammars"):
+        load_plugins("scene_envs.grammars")
+    return list_scene_types()
+
+
+_REGISTERED = {"reward": known_rewards, "mask": known_masks, "scene": known_scenes}
+
+
+def group_options(folder: str, config_dir: str = "") -> list[str]:
+    """Names of the YAML files of a group in ``configs`` and in the user's folder, sorted."""
+    places = [resources.files("configs") / folder, *([Path(config_dir) / folder] if config_dir else [])]
+    files = [file.name for place in places if folder and place.is_dir() for file in place.iterdir()]
+    return sorted({name.removesuffix(".yaml") for name in files if name.endswith(".yaml")})
+
+
+def field_options(field: dataclasses.Field[Any], config_dir: str = "") -> list[str]:
+    """Options of a field: registered components and YAML files, sorted."""
+    return sorted({*field.metadata["registered"](), *group_options(field.metadata["folder"], config_dir)})
+
+
+def check_option(folder: str, option: str, known: Sequence[str]) -> None:
+    """Refuse an option that a group does not have.
+
+    Raises:
+        UnknownNameError: names the nearest one.
+    """
+    if option not in known:
+        raise unknown_name(folder, option, known)
+
+
+def composed(kind: Kind) -> Kind:
+    """A config dataclass that is made in Python as on the command line.
+
+    A group may be given as its dataclass, as a mapping of those of its keys that differ, or as the name of an option;
+    ``recipe`` sets all values that are not given.
+    """
+    init = kind.__init__  # type: ignore[misc]
+    signature = inspect.signature(init)
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+
+    @functools.wraps(init)
+    def __init__(self: Any, *arguments: Any, **keywords: Any) -> None:
+        for key in keywords:
+            if key not in fields:
+                raise unknown_name(f"{kind.__name__} field", key, fields)
+        given = dict(signature.bind(self, *arguments, **keywords).arguments)
+        given.pop("self")
+        init(self, **_complete(kind, given, fields))
+
+    kind.__init__ = __init__  # type: ignore[misc]
+    return kind
+
+
+def _complete(kind: type, given: Mapping[str, Any], fields: Mapping[str, dataclasses.Field[Any]]) -> dict[str, Any]:
+    """The values given in Python, over those of the recipe and of the named options."""
+    choices = {
+        name: value
+        for name, value in given.items()
+        if isinstance(value, str) and fields[name].metadata.get("folder") and not fields[name].metadata.get("named")
+    }
+    for name, value in choices.items():
+        check_option(name, value, field_options(fields[name]))
+    options = set(choices)
+    if "recipe" in given and given["recipe"] != fields["recipe"].default and len(given) < len(fields):
+        choices["recipe"] = given["recipe"]
+        check_option("recipe", given["recipe"], group_options("recipe"))
+    tree = by_hydra(kind.__name__, kind, choices)
+    values = field_values(kind, {name: value for name, value in tree.items() if name not in given})
+    for name, value in given.items():
+        values[name] = _group(fields[name], name, {} if name in options else value, tree.get(name, {}))
+    return values
+
+
+def _group(field: dataclasses.Field[Any], name: str, value: Any, base: Mapping[str, Any]) -> Any:
+    """A group given as a mapping becomes its dataclass; other values stay as they are."""
+    if field.default_factory is dataclasses.MISSING or not dataclasses.is_dataclass(default := field.default_factory()):
+        return value
+    tree = value
+    if isinstance(value, Mapping):
+        same = value.get("name", base.get("name")) in (None, getattr(default, "name", None))
+        tree = merged(merged(plain_tree(default) if same and not field.metadata.get("kinds") else {}, base), value)
+    return convert(field, type(default), tree, name)
+
+
+# Composition: Hydra composes the options chosen, its parser reads single values, OmegaConf resolves interpolations
+
+
+def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: str = "") -> dict[str, Any]:
+    """Values of the options chosen, as Hydra composes them; interpolations are not resolved.
+
+    Args:
+        command: name of the command in messages.
+        kind: config dataclass, whose fields say which groups there are.
+        choices: options by field, besides ``recipe`` and ``+experiment``.
+        config_dir: folder with further groups and experiments.
+
+    Raises:
+        InvalidInputError: Hydra cannot read a file.
+    """
+    if not choices:
+        return {}
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    compose = _compose if config_dir else _compose_once
+    try:
+        return copy.deepcopy(compose(kind, tuple(choices.items()), config_dir))
+    except (HydraException, OmegaConfBaseException) as error:
+        if f"In 'recipe/{choices.get('recipe')}'" in str(error):
+            raise InvalidInputError(
+                f"recipe={choices['recipe']} is not for {command}: it chooses from groups that {command} does not have"
+            ) from error
+        raise InvalidInputError(f"{command}: {reason_of(error)}") from error
+
+
+def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str = "") -> dict[str, Any]:
+    """The composition of a config whose groups are empty but for the options chosen."""
+    from hydra import compose, initialize_config_module
+    from hydra.core.config_store import ConfigStore
+    from omegaconf import OmegaConf
+
+    groups = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("folder")}
+    keys = {name: field.metadata["folder"] for name, field in groups.items()}
+    paths = {name: folder if folder == name else f"{folder}@{name}" for name, folder in keys.items()}
+    store = ConfigStore.instance()
+    for name, folder in keys.items():
+        found = groups[name].metadata["registered"]()
+        nodes = found if isinstance(found, Mapping) else {option: {"name": option} for option in found}
+        store.repo.pop(folder, None)
+        for option in nodes.keys() - set(group_options(folder, config_dir)):  # a file takes the place of a node
+            store.store(group=folder, name=option, node=dict(nodes[option]))
+    defaults: list[Any] = ["_self_", *({path: None} for path in paths.values())]
+    defaults += [{"recipe": None}] if any(field.name == "recipe" for field in dataclasses.fields(kind)) else []
+    store.store(name="primary", node={"defaults": defaults})
+    words = [f"{paths.get(key, key)}={option}" for key, option in choices]
+    words += [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
+    with initialize_config_module("configs", version_base="1.3"):
+        made = OmegaConf.to_container(compose("primary", overrides=words), resolve=False)
+    assert isinstance(made, dict)
+    return {str(key): value for key, value in made.items()}
+
+
+_compose_once = functools.lru_cache(maxsize=256)(_compose)
+
+
+def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested values, those of ``second`` over those of ``first``."""
+    both = [key for key, value in second.items() if isinstance(value, Mapping) and isinstance(first.get(key), Mapping)]
+    return {**first, **second, **{key: merged(first[key], second[key]) for key in both}}
+
+
+def reason_of(error: BaseException) -> str:
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return str(error).splitlines()[0].strip().rstrip(".")
+
+
+# Keys that several commands share
+
+
+MAX_GRADIENT_NORM = 1.0
+"""Largest norm of a gradient in training; longer gradients are scaled down."""
+
+
+@dataclass
+class OptimizerSettings:
+    """An optimiser of weights.
+
+    Attributes:
+        name: name of the optimiser: ``adamw``.
+        lr: peak learning rate.
+    """
+
+    KNOWN: ClassVar[Sequence[str]] = ("adamw",)
+    """Optimisers by name."""
+
+    name: str = "adamw"
+    lr: float = 1e-3
+
+    def __post_init__(self) -> None:
+        require_one_of(self, "name", self.KNOWN, "optimizer")
+        require_positive(self, "lr")
+
+
+@dataclass
+class LoggerSettings:
+    """Files of a run, and how often they are written.
+
+    Attributes:
+        name: ``csv`` writes log.csv, which every run has; ``tensorboard`` and ``wandb`` (offline) write their own files
+            as well.
+        checkpoint_every: steps or iterations between resumable checkpoints.
+    """
+
+    name: str = "csv"
+    checkpoint_every: int = 10
+
+    def __post_init__(self) -> None:
+        require_one_of(self, "name", LOGGERS, "logger")
+        require_at_least(self, 1, "checkpoint_every")
+
+
+@dataclass
+class DeviceKeys:
+    """Device of the networks.
+
+    Attributes:
+        device: torch device, such as cpu, cuda or cuda:1.
+    """
+
+    device: str = "cpu"
+
+
+@dataclass
+class ProgressKeys:
+    """Progress of the work.
+
+    Attributes:
+        progress: progress display: ``bar`` (lines where there is no terminal), ``lines`` or ``none``.
+    """
+
+    progress: str = "bar"
+
+
+@dataclass
+class SamplingKeys:
+    """Sampling of scenes.
+
+    Attributes:
+        prompt: text that the scenes should match, for priors that read prompts; null for no prompt.
+        guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
+        claim_guidance: strength with which scenes are guided to the numbers and places that the prompt gives, 0 for
+            none; 2 is a good choice; needs a prompt.
+        num_steps: denoising steps per scene.
+        slots: slots per scene, which may exceed the number in training; null takes the number in training.
+        seed: seed of the noise.
+    """
+
+    prompt: str | None = None
+    guidance: float = 0.0
+    claim_guidance: float = 0.0
+    num_steps: int = 50
+    slots: int | None = None
+    seed: int = 0
+
+
+@dataclass
+class DrawKeys(DeviceKeys):
+    """Sampling from a prior, with prior=.
+
+    Attributes:
+        num_steps: denoising steps per scene, with prior=.
+        physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps, 0
+            to 1, with prior=; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0 for
+            the others.
+    """
+
+    num_steps: int = 50
+    physics_guidance: float | None = None
+
+
+@dataclass
+class RewardLimits:
+    """Limits of a reward from outside this package; it runs in its own process.
+
+    Attributes:
+        reward_timeout: most seconds that the reward may take for a batch; after that the scenes of the batch are
+            invalid.
+        reward_memory: most memory that the reward may allocate, GiB.
+    """
+
+    reward_timeout: float = 60.0
+    reward_memory: float = 1.0
+
+
+@dataclass
+class OutputKeys(DeviceKeys):
+    """Computation and output.
+
+    Attributes:
+        output: folder for the files that the command writes.
+        pictures: number of scenes in the galleries; 0 draws none.
+        batch_size: scenes denoised at once.
+        workers: physics worker processes; 0 computes physics in this process.
+    """
+
+    output: str = ""
+    pictures: int = 12
+    batch_size: int = 64
+    workers: int = 2
+
+
+@dataclass
+class TrainingKeys(DeviceKeys):
+    """Recipe and output of a training run.
+
+    Attributes:
+        recipe: a named set of values for the other keys; keys that are given as well override it.
+        output: run folder; a run that was interrupted there is resumed; empty for runs/COMMAND-TIME on the command
+            line.
+    """
+
+    recipe: str = "ours"
+    output: str = ""
+
+
+MEASURE_NAMES = ("layout", "physics", "ready", "fsd", "novelty", "prompts", "classifier", "renders", "fid")
+"""Groups of measures, in the order in which they are computed: cheap ones first."""

@@ -1,0 +1,381 @@
+"""Spacing of objects: distances between neighbours, compared with real scenes."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_envs.arrays import Array, Index
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_distance import (
+    PlacedObjects,
+    SceneObjects,
+    check_same_assets,
+    counted_objects,
+    cutoff,
+    matching_distance,
+)
+
+SAME_HEIGHT = 0.02
+"""Largest difference in height (m) between the frames of two neighbours."""
+MAX_DISTANCE = 0.5
+"""Bound of a distance (m), so that places on other tables of a room do not outweigh neighbours."""
+MIN_DISTANCES = 30
+"""Smallest number of distances of a pair of assets, in each of the two batches; rarer pairs are left out."""
+
+_CHUNK = 128
+
+
+def spacing_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float | None:
+    """Distance of the distributions of distances between neighbours from those of real scenes, m.
+
+    For each ordered pair of assets (a, b), the horizontal distances from the free objects a to the nearest free object
+    b at the same height form a distribution. The figure is the Wasserstein-1 distance of samples and reference, as a
+    mean over the pairs, weighted by their number of distances in the reference. It shows whether objects are pushed
+    apart or crowded, even if their number and categories are those of real scenes.
+
+    Args:
+        batch: the samples.
+        reference: real scenes of the same assets.
+
+    Returns:
+        The distance in m; None if no pair of assets has 30 distances in both batches.
+
+    Raises:
+        InvalidInputError: the batches have other assets.
+
+    >>> spacing_wasserstein(SceneBatch.empty("dimsum_table", 3), SceneBatch.empty("dimsum_table", 5)) is None
+    True
+    """
+    from scipy.stats import wasserstein_distance
+
+    check_same_assets(batch, reference)
+    samples, real = _distances(batch), _distances(reference)
+    pairs = [pair for pair in real if min(len(real[pair]), len(samples.get(pair, ()))) >= MIN_DISTANCES]
+    if not pairs:
+        return None
+    distances = [float(wasserstein_distance(samples[pair], real[pair])) for pair in pairs]
+    return float(np.average(distances, weights=[len(real[pair]) for pair in pairs]))
+
+
+def _distances(batch: SceneBatch) -> Mapping[tuple[int, int], np.ndarray[tuple[int], np.dtype[np.float64]]]:
+    """Distances (K,) m from objects of an asset to the nearest object of another, or of the same one, by pair."""
+    found = defaultdict(list)
+    for start in range(0, len(batch), _CHUNK):
+        chunk = batch[start : start + _CHUNK].to("cpu")
+        places, free, categories = chunk.translations.double(), chunk.is_free, chunk.categories
+        offset = places[:, :, None] - places[:, None]  # (B, N, N, 3)
+        level = (offset[..., 2].abs() < SAME_HEIGHT) & free[:, :, None] & free[:, None]
+        level.diagonal(dim1=1, dim2=2).fill_(False)
+        distance = offset[..., :2].norm(dim=-1).masked_fill(~level, torch.inf)
+        for other in categories[free].unique().tolist():
+            nearest = distance.masked_fill((categories != other)[:, None], torch.inf).amin(dim=-1)  # (B, N)
+            there = nearest.isfinite()
+            for asset in categories[there].unique().tolist():
+                values = nearest[there & (categories == asset)].clamp(max=MAX_DISTANCE)
+                found[asset, other].append(values.numpy())
+    return {pair: np.concatenate(parts) for pair, parts in found.items()}
+
+
+DUPLICATE = 0.01
+"""Largest distance (m) between objects that count as at the same place."""
+CANDIDATES = 32
+"""Number of scenes, the nearest by their features, to which the exact distance is computed."""
+
+_ROWS = 256
+"""Number of scenes whose features are compared with all others at once."""
+_WAVES = 12
+"""Number of test functions of the position, for each asset."""
+
+
+@dataclass(frozen=True)
+class Neighbors:
+    """The nearest scene to each of B scenes.
+
+    Attributes:
+        distance: (B,) m, distance to the nearest scene; see :func:`scene_envs.scene_distance.scene_distances`.
+        index: (B,) int64, index of the nearest scene.
+        copied: (B,) bool, whether one of the other scenes has the same assets, each within 1 cm of its counterpart.
+
+    >>> from scene_envs.grammars import get_grammar
+    >>> scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 6)
+    >>> found = nearest_scenes(scenes[2:4], scenes)
+    >>> found.index.tolist(), found.distance.tolist(), found.copied.tolist()
+    ([2, 3], [0.0, 0.0], [True, True])
+    """
+
+    distance: Tensor
+    index: Tensor
+    copied: Tensor
+
+
+def nearest_scenes(batch: SceneBatch, others: SceneBatch, *, candidates: int = CANDIDATES) -> Neighbors:
+    """The scene of ``others`` that is nearest to each scene of ``batch``, by its :func:`distance
+    <scene_envs.scene_distance.scene_distances>`.
+
+    The distance is computed exactly for the ``candidates`` scenes that are nearest by features. A feature is the sum of
+    a function of the position over all objects of one asset. The functions are bounded and have slope 1 at most, so
+    that a feature of two scenes never differs by more than the total cost of matching them (Kantorovich duality).
+
+    Raises:
+        InvalidInputError: no scenes, or scenes of other assets.
+    """
+    check_same_assets(batch, others)
+    if not len(others) or not len(batch):
+        raise InvalidInputError(f"{len(batch)} scenes have no nearest among {len(others)}: both need at least one")
+    limit = cutoff(batch.scene_type)
+    chosen = _nearest_features(_features(batch, limit), _features(others, limit), min(candidates, len(others)))
+    mine, theirs = list(SceneObjects(batch)), SceneObjects(others)
+    distance, index, copied = torch.zeros(len(batch), dtype=torch.float64), torch.zeros(len(batch)).long(), []
+    for row, columns in enumerate(chosen.tolist()):
+        found = [matching_distance(mine[row], theirs[column], limit) for column in columns]
+        best = int(np.argmin(found))
+        distance[row], index[row] = found[best], columns[best]
+        copied.append(any(_is_copy(mine[row], theirs[column]) for column in columns))
+    return Neighbors(distance, index, torch.tensor(copied))
+
+
+def novelty(samples: Neighbors, real: Neighbors) -> float:
+    """Median distance of samples to their nearest training scene, over that of held-out real scenes.
+
+    At least 1 for samples that are as new as real scenes, 0 for copies; infinite when the held-out scenes are copies
+    of training scenes themselves and the samples are not.
+
+    Args:
+        samples: nearest training scenes of the samples.
+        real: nearest training scenes of held-out real scenes, from the same training scenes.
+    """
+    above, below = float(samples.distance.median()), float(real.distance.median())
+    return above / below if below > 0 else (1.0 if above == 0 else math.inf)
+
+
+def duplicates(batch: SceneBatch) -> float:
+    """Share of the scenes that another scene of the batch repeats: same assets, each within 1 cm of its counterpart.
+
+    >>> duplicates(SceneBatch.empty("dimsum_table", 4))
+    1.0
+    """
+    objects = list(SceneObjects(batch))
+    groups: dict[bytes, list[int]] = {}
+    for row, (categories, _) in enumerate(objects):
+        groups.setdefault(categories.tobytes(), []).append(row)
+    repeated: set[int] = set()
+    for rows in groups.values():
+        for first, second in _close_pairs([objects[row][1] for row in rows]):
+            pair = rows[first], rows[second]
+            if not repeated.issuperset(pair) and _is_copy(objects[pair[0]], objects[pair[1]]):
+                repeated.update(pair)
+    return len(repeated) / len(batch)
+
+
+def _is_copy(first: PlacedObjects, second: PlacedObjects) -> bool:
+    """Whether the assets are the same and can be matched so that all are within :data:`DUPLICATE`."""
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import maximum_bipartite_matching
+
+    if not np.array_equal(first[0], second[0]):
+        return False
+    near = ((first[1][:, None] - second[1][None]) ** 2).sum(axis=-1) <= DUPLICATE**2
+    near &= first[0][:, None] == second[0][None]
+    if not near.any(axis=1).all():
+        return False
+    return bool((maximum_bipartite_matching(csr_matrix(near)) >= 0).all())
+
+
+def _close_pairs(positions: list[Array]) -> Index:
+    """(P, 2): pairs of scenes whose centres are near enough for them to be copies; all are of the same assets."""
+    from scipy.spatial import KDTree
+
+    if len(positions) < 2:
+        return np.empty((0, 2), dtype=np.int64)
+    centers = np.stack([scene.mean(axis=0) if len(scene) else np.zeros(3) for scene in positions])
+    return KDTree(centers).query_pairs(DUPLICATE * 1.001, output_type="ndarray")
+
+
+# -- features --------------------------------------------------------------------------------------
+
+
+def _features(batch: SceneBatch, limit: float) -> Tensor:
+    """(B, C * (1 + waves)) m: per asset, the sums over its objects of functions with slope <= 1 and range <= ``limit``.
+
+    The functions are the constant ``limit`` / 2 and waves of the position in random directions, equal for all scenes.
+    """
+    generator = torch.Generator().manual_seed(0)
+    direction = torch.nn.functional.normalize(torch.randn(3, _WAVES, generator=generator), dim=0)
+    length = limit / 2 * torch.logspace(0, 1, _WAVES, 2.0)  # slope 1 at amplitude limit / 2 when length = limit / 2
+    phase = 2 * math.pi * torch.rand(_WAVES, generator=generator)
+    chunks = []
+    for start in range(0, len(batch), 1024):
+        part = batch[start : start + 1024].to("cpu")
+        one_hot = part.tensor[..., 12:-1] * counted_objects(part).unsqueeze(-1)  # (b, N, C)
+        waves = (limit / 2) * torch.sin(part.translations @ direction / length + phase)  # (b, N, waves)
+        waves = torch.cat([torch.full_like(waves[..., :1], limit / 2), waves], dim=-1)
+        chunks.append(torch.einsum("bnc,bnw->bcw", one_hot, waves).flatten(1))
+    return torch.cat(chunks)
+
+
+def _nearest_features(features: Tensor, others: Tensor, count: int) -> Tensor:
+    """(B, count) int64: rows of ``others`` with the nearest features."""
+    used = (features != 0).any(dim=0) | (others != 0).any(dim=0)
+    features, others = features[:, used], others[:, used]
+    chunks = features.split(_ROWS)
+    return torch.cat([torch.cdist(chunk, others).topk(count, dim=1, largest=False).indices for chunk in chunks])
+
+
+def tallest_stacks(batch: SceneBatch) -> Tensor:
+    """Number of objects in the tallest stack of each scene, (B,) int64.
+
+    A stack is a chain of free objects, each standing on the one below or lying in it
+    (:attr:`SceneBatch.supports <scene_envs.scene.AssetFacts.supports>`). A lone object is a stack of one.
+    A scene without free objects has 0.
+
+    >>> tallest_stacks(SceneBatch.empty("dimsum_table", 2)).tolist()
+    [0, 0]
+    """
+    below, free = batch.supports, batch.is_free
+    on_free = (below >= 0) & free.gather(1, below.clamp(min=0))
+    levels = free.long()  # (B, N): objects from each object down to the lowest free one below it
+    for _ in range(below.shape[1]):
+        deeper = torch.where(free & on_free, 1 + levels.gather(1, below.clamp(min=0)), free.long())
+        if torch.equal(deeper, levels):
+            break
+        levels = deeper
+    return levels.amax(dim=1)
+
+
+def stack_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
+    """Wasserstein-1 distance of the tallest stack per scene, in objects.
+
+    It shows whether stacks are lower than in real scenes, even if the number and categories of objects are those of
+    real scenes.
+
+    Args:
+        batch: the samples, at least one.
+        reference: real scenes of the same assets, at least one.
+
+    Raises:
+        InvalidInputError: the batches have other assets.
+
+    >>> stack_wasserstein(SceneBatch.empty("dimsum_table", 3), SceneBatch.empty("dimsum_table", 5))
+    0.0
+    """
+    from scipy.stats import wasserstein_distance
+
+    check_same_assets(batch, reference)
+    return float(wasserstein_distance(tallest_stacks(batch).cpu().numpy(), tallest_stacks(reference).cpu().numpy()))
+
+
+@dataclass(frozen=True)
+class Support:
+    """Support of objects of a scene type: a surface fixed in the world, or the top of another object.
+
+    Attributes:
+        kind: name under which the height error is reported, such as ``"table"`` or ``"stack"``.
+        height: z of the surface (m), in the world, or above the frame of the supporting object.
+        on: names of the supporting assets; None if the surface is fixed in the world.
+        riders: names of the assets that can rest there; None means all free ones.
+        reach: largest horizontal distance (m) between the frames of rider and supporting object.
+        catch: largest height error (m) at which a rider within reach is assigned to this support, even if another
+            surface is nearer; for supports that are thinner than the errors, such as a plate on a table.
+
+    >>> [support.kind for support in SUPPORTS["dimsum_table"]]
+    ['table', 'stack']
+    """
+
+    kind: str
+    height: float
+    on: tuple[str, ...] | None = None
+    riders: tuple[str, ...] | None = None
+    reach: float = 0.06
+    catch: float = 0.0
+
+
+@dataclass(frozen=True)
+class Container:
+    """Hollow assets, in which objects lie as they fell; these objects have no correct height and are left out.
+
+    Attributes:
+        names: names of the hollow assets.
+        riders: objects that may lie in them.
+        reach: largest horizontal distance (m) between the frames.
+        depth: largest height (m) of the rider's frame above the container's; the smallest is 1 cm.
+
+    >>> [container.names for container in CONTAINERS]
+    [('fruit_bowl',), ('bowl',), ('utensil_crock',)]
+    """
+
+    names: tuple[str, ...]
+    riders: tuple[str, ...]
+    reach: float
+    depth: float
+
+
+_FRUIT = (
+    "apple_gala", "apple_golden", "apple_green", "apple_red", "avocado_a", "avocado_b", "avocado_c", "pear_anjou",
+    "pear_bosc", "pear_red",
+)  # fmt: skip
+_UTENSILS = ("dinner_spoon", "fork", "knife", "teaspoon")
+_DISHES = ("dinner_plate", "serving_dish", "steamer_bottom", "steamer_lid", "teacup", "teapot")
+_STEAMERS = Support("stack", 0.091, on=("steamer_bottom",), riders=("steamer_bottom", "steamer_lid"))
+_TIERS = (-0.3915, -0.1232, 0.1392, 0.4075)
+_BIG_GAMES = ("board_game_l", "board_game_l2", "board_game_xl")
+_SHELF_LOADS = (
+    *_BIG_GAMES, "apple_gala", "board_game_s", "book", "bread_slice", "fruit_bowl", "game_case", "lamp", "pear_bosc",
+    "shared_plate", "soda_can", "speaker", "stacking_ring", "tea_bottle", "toy_train",
+)  # fmt: skip
+_PLATE, _CATCH = 0.006, 0.03
+"""Height (m) of the inside of plates and breakfast bowls, and ``catch`` (m) of the objects that lie there."""
+
+_TABLE = Support("table", 0.0)
+_FOOD = (
+    Support("plate", _PLATE, on=("shared_plate",), riders=("apple_gala", "bread_slice", "pear_bosc"), catch=_CATCH),
+    Support("stack", 0.016, on=("bread_slice",), riders=("bread_slice",), catch=_CATCH),
+)
+_BREAKFAST = (
+    _TABLE,
+    *_FOOD,
+    Support("plate", _PLATE, on=("plate",), riders=("apple_gala", "bowl", "bread_slice", "pear_bosc"), catch=_CATCH),
+    Support("bowl", _PLATE, on=("bowl",), riders=("apple_gala", "pear_bosc"), catch=_CATCH),
+)
+_GAMES = (
+    Support("stack", 0.055, on=("board_game_l", "board_game_xl"), riders=_BIG_GAMES),
+    Support("stack", 0.069, on=("board_game_l2",), riders=_BIG_GAMES),
+    Support("stack", 0.060, on=("board_game_s",), riders=("board_game_s",)),
+    Support("stack", 0.0125, on=("game_case",), riders=("game_case",)),
+)
+_SHELF = tuple(Support("tier", height) for height in _TIERS)
+_RESTAURANT = (
+    Support("furniture", 0.0, riders=("cafe_table",)),
+    Support("furniture", -0.3775, riders=("shelf",)),
+    Support("floor", -0.785, riders=("chair",)),
+    Support("table", 0.0, on=("cafe_table",), riders=_DISHES, reach=0.7),
+    _STEAMERS,
+    *(Support("tier", height, on=("shelf",), riders=_SHELF_LOADS, reach=0.34) for height in _TIERS),
+    *_GAMES,
+    *_FOOD,
+)
+
+SUPPORTS: dict[str, tuple[Support, ...]] = {
+    "breakfast_table_high_clutter": _BREAKFAST,
+    "breakfast_table_low_clutter": _BREAKFAST,
+    "dimsum_table": (_TABLE, _STEAMERS),
+    "living_room_shelf": (*_SHELF, *_GAMES, *_FOOD),
+    "pantry_shelf": _SHELF,
+    "restaurant_high_clutter": _RESTAURANT,
+    "restaurant_low_clutter": _RESTAURANT,
+}
+"""Supports of each scene type, by name; scene types without an entry have no height figures."""
+
+CONTAINERS: tuple[Container, ...] = (
+    Container(("fruit_bowl",), _FRUIT, reach=0.11, depth=0.15),
+    Container(("bowl",), ("bread_slice",), reach=0.08, depth=0.10),
+    Container(("utensil_crock",), _UTENSILS, reach=0.10, depth=0.20),
+)
+"""Containers of all scene types."""

@@ -1,0 +1,469 @@
+"""Search tree in ``tree.json``: every scene of a search with its parent, value and cost."""
+
+from __future__ import annotations
+
+import hashlib
+import heapq
+import itertools
+import json
+import math
+import os
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from agents.planning.ledger import PlanResult
+from agents.planning.settings import SearchConfig
+from scene_envs.envs import SearchState
+from scene_envs.errors import CorruptFileError
+from scene_envs.files import finite, page_part, page_template, write_json, write_text
+from scene_envs.scene import SceneBatch
+
+_FORMAT = "scene-envs search tree 1"
+
+
+@dataclass(frozen=True)
+class TreeNode:
+    """One scene of a search.
+
+    Attributes:
+        id: index in the list of nodes; roots first, then in the order of expansion.
+        parent: id of the node from which it was inpainted; None for a root.
+        action: index among the children of its parent; None for a root.
+        depth: number of inpaintings since the root.
+        value: Φ in [0, 1]; None if the objective could not score the scene.
+        objective: raw objective; None if the scene could not be scored.
+        visits: number of scored scenes at and below this node.
+        nfe: denoiser evaluations of all searches of the run up to and including this scene.
+        mask: slots that its children regenerate.
+    """
+
+    id: int
+    parent: int | None
+    action: int | None
+    depth: int
+    value: float | None
+    objective: float | None
+    visits: int
+    nfe: int
+    mask: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class SearchRecord:
+    """Trees of a search run with any planner, the content of ``tree.json``.
+
+    Attributes:
+        settings: ``planner``, ``objective``, ``objective_scale`` (objective at Φ = 1) and ``nfe_per_scene``.
+        searches: one mapping per search, the best first: ``seed``, ``root`` and ``best`` (ids).
+        nodes: nodes of all searches.
+
+    >>> node = TreeNode(0, None, None, 0, 0.5, 2.0, 1, 0, (1, 2))
+    >>> record = SearchRecord({"planner": "greedy"}, [{"seed": 0, "root": 0, "best": 0}], [node])
+    >>> record.path(0)
+    [0]
+    """
+
+    settings: Mapping[str, Any]
+    searches: Sequence[Mapping[str, int]]
+    nodes: Sequence[TreeNode]
+
+    @classmethod
+    def of(
+        cls,
+        roots: Sequence[SearchState],
+        states: Iterable[SearchState],
+        best: Mapping[int, tuple[int, ...]],
+        settings: Mapping[str, Any],
+    ) -> SearchRecord:
+        """The record of searches that started from ``roots``.
+
+        Args:
+            roots: a state per search, each with a seed of its own.
+            states: all expanded states, in order.
+            best: path of the best state, by seed; the best search first.
+            settings: settings of the search; must contain ``nfe_per_scene``.
+        """
+        rows: list[dict[str, Any]] = []
+        ids: dict[tuple[int, tuple[int, ...]], int] = {}
+        for state in (*roots, *states):
+            path = state.path
+            while path and (state.seed, path[:-1]) not in ids:  # the nearest ancestor in the record
+                path = path[:-1]
+            rows.append(
+                {
+                    "id": len(rows),
+                    "parent": ids[state.seed, path[:-1]] if path else None,
+                    "action": state.path[-1] if path else None,
+                    "depth": state.depth,
+                    "value": state.value if state.valid else None,
+                    "objective": state.objective if state.valid else None,
+                    "visits": int(state.valid),
+                    "nfe": max(0, len(rows) + 1 - len(roots)) * settings["nfe_per_scene"],
+                    "mask": tuple(torch.nonzero(state.mask).flatten().tolist()),
+                }
+            )
+            ids[state.seed, state.path] = rows[-1]["id"]
+        for row in reversed(rows):
+            if row["parent"] is not None:
+                rows[row["parent"]]["visits"] += row["visits"]
+        searches = [
+            {"seed": seed, "root": ids[seed, ()], "best": ids.get((seed, path), ids[seed, ()])}
+            for seed, path in best.items()
+        ]
+        return cls(dict(settings), searches, [TreeNode(**row) for row in rows])
+
+    def path(self, node: int) -> list[int]:
+        """Ids from the root to ``node``."""
+        ids = [node]
+        while (parent := self.nodes[ids[-1]].parent) is not None:
+            ids.append(parent)
+        return ids[::-1]
+
+    def tree_of(self, search: int) -> list[TreeNode]:
+        """Nodes of one search, by its place in ``searches``; the root first."""
+        inside = {self.searches[search]["root"]}
+        for node in self.nodes:
+            if node.parent in inside:
+                inside.add(node.id)
+        return [self.nodes[node] for node in sorted(inside)]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the record atomically, as JSON with a digest of its content."""
+        content = finite({**vars(self), "nodes": [asdict(node) for node in self.nodes]})
+        write_json(path, {"format": _FORMAT, "sha256": _digest(content), **content}, indent=None)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> SearchRecord:
+        """The record that :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: the file does not exist.
+            CorruptFileError: the file is damaged, or is no search tree.
+        """
+        text = Path(path).read_bytes()
+        try:
+            content = json.loads(text)
+            kind, digest = content.pop("format"), content.pop("sha256")
+        except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
+            raise CorruptFileError(
+                f"{str(path)!r} is truncated or no search tree; run the search again with the same output to write it"
+            ) from error
+        if kind != _FORMAT:
+            raise CorruptFileError(f"{str(path)!r} is {kind!r}, and {_FORMAT!r} is needed")
+        if digest != _digest(content):
+            raise CorruptFileError(
+                f"{str(path)!r} was changed after it was written; run the search again with the same output to write it"
+            )
+        nodes = [TreeNode(**{**node, "mask": tuple(node["mask"])}) for node in content["nodes"]]
+        return cls(content["settings"], content["searches"], nodes)
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=True).encode()).hexdigest()
+
+
+def loss_of(plan: PlanResult) -> float:
+    """Minus the best value of a plan; infinity if no scene could be scored."""
+    return -plan.best_value if math.isfinite(plan.best_value) else math.inf
+
+
+def search_metrics(
+    objective: Any,
+    scale: float,
+    config: SearchConfig,
+    searches: Sequence[PlanResult],
+    best_of: PlanResult | None,
+    firsts: dict[int, SearchState],
+    seconds: dict[str, float],
+    stopped: str,
+    spent: int,
+    from_scenes: bool,
+) -> dict[str, Any]:
+    """The figures of a run.
+
+    Args:
+        objective: the objective of the search.
+        scale: objective at Φ = 1.
+        config: the settings.
+        searches: all plans.
+        best_of: the baseline; None without one.
+        firsts: best of the first samples of each search, or the scene it started from, by the seed of the search.
+        seconds: duration of the search and the baseline.
+        stopped: reason for which the run ended early; empty if it did not.
+        spent: number of scenes generated.
+        from_scenes: whether the searches started from given scenes.
+    """
+    search = min(searches, key=loss_of)
+    first = firsts[search.best_state.seed]
+    metrics = {
+        "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", repr(objective)),
+        "objective_scale": scale,
+        "saturated": search.best_state.objective > scale,
+        "below_zero": search.best_state.objective < 0,
+        "planner": config.planner.name,
+        "stopped": stopped or None,
+        "nfe": spent * config.nfe_per_scene,
+        "start" if from_scenes else "first_samples": _of_state(first),
+        "search": _of_plan(search),
+        "seconds": {name: round(value, 2) for name, value in seconds.items()},
+    }
+    if len(searches) > 1:
+        metrics["searches"] = [
+            _of_plan(plan) | ({"start": _of_state(firsts[plan.best_state.seed])} if from_scenes else {})
+            for plan in searches
+        ]
+    if best_of is not None:
+        metrics["best_of"] = _of_plan(best_of)
+    return metrics
+
+
+def _of_state(state: SearchState) -> dict[str, float | None]:
+    return {"value": state.value, "objective": state.objective} if state.valid else {"value": None, "objective": None}
+
+
+def _of_plan(plan: PlanResult) -> dict[str, Any]:
+    return {
+        **_of_state(plan.best_state),
+        "path": list(plan.best_path),
+        "expansions": len(plan.values),
+        "invalid": sum(map(math.isnan, plan.values)),
+        "curve": finite(plan.curve),
+    }
+
+
+def draw_curve(
+    curves: Mapping[str, Sequence[float]],
+    path: Path,
+    *,
+    num_steps: int,
+    first: int,
+    scale: float = 1.0,
+    label: str = "objective",
+) -> Path:
+    """Best objective against denoiser evaluations, one line per planner.
+
+    Args:
+        curves: best Φ after each generated scene, by planner; values that are not finite are left out.
+        path: image file to write.
+        num_steps: denoiser evaluations per generated scene.
+        first: number of scenes that were fresh samples in the tree search; a line marks their end. 0 draws no line.
+        scale: raw objective at Φ = 1.
+        label: name of the objective.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    figure = Figure(figsize=(6.4, 4.0), dpi=150, layout="constrained")
+    axes = figure.subplots()
+    for (name, curve), color in zip(curves.items(), ("#1f6f8b", "#9aa0a6", "#c8553d", "#5a8f29"), strict=False):
+        points = [(n * num_steps, scale * v) for n, v in enumerate(curve, start=1) if math.isfinite(v)]
+        if points:
+            axes.step(*zip(*points, strict=True), where="post", label=name, color=color, linewidth=2)
+    if first:
+        axes.axvline(first * num_steps, color="#9aa0a6", linewidth=1, linestyle=":", label="first samples")
+    axes.set_xlabel("denoiser evaluations (NFE)")
+    axes.set_ylabel(f"best {label}")
+    axes.set_xlim(left=0)
+    if all(math.isclose(scale * v, round(scale * v)) for v in itertools.chain(*curves.values()) if math.isfinite(v)):
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.spines[["top", "right"]].set_visible(False)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(frameon=False, loc="lower right")
+    figure.savefig(path)
+    return path
+
+
+def draw_scene(scene: SceneBatch, state: Any, path: Path, *, width: int = 640, height: int = 480) -> Path:
+    """Draw one scene; the objects that its state would regenerate next are red.
+
+    Args:
+        scene: a batch of one.
+        state: search state of the scene; ``value``, ``objective`` and ``mask`` (N,) are read.
+        path: image file to write.
+        width: width of the picture in pixels.
+        height: height of the picture in pixels.
+    """
+    from scene_envs.render import gallery, render
+
+    marked = state.mask.unsqueeze(0) & scene.is_free
+    image = render(scene, width=width, height=height, highlight=marked)[0]
+    objects = int(scene.is_free.sum())
+    objective = f"objective {state.objective:.4g}" if state.valid else "not scored"
+    caption = f"{objective} | {objects} free objects | {int(marked.sum())} to redo (red)"
+    gallery([image], columns=1, captions=[caption]).save(path)
+    return path
+
+
+MAX_PATH_SCENES = 60
+"""Largest number of scenes of the best path that are shown; some steps of a longer path are left out."""
+MAX_OTHER_SCENES = 24
+"""Largest number of other scenes that are shown, the best ones."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """A scene in the drawing of the best scenes and their ancestors.
+
+    Attributes:
+        node: node of the scene.
+        column: depth of the node; the first samples, or the scene that the search started from, have depth 0.
+        row: row of the card, counted from 0; a first child is in the row of its parent.
+        parent: index of the parent's card; None for a first sample.
+        number: number of the scene in its search, counted from 1.
+        frame: index of the scene in the 3-D view, which draws its picture; None without one.
+        on_path: whether it leads to the best scene.
+    """
+
+    node: TreeNode
+    column: int
+    row: int
+    parent: int | None
+    number: int
+    frame: int | None
+    on_path: bool
+
+
+def best_path(record: SearchRecord) -> list[int]:
+    """Ids of the scenes that lead to the best one, from a first sample or the scene that the search started from."""
+    return record.path(record.searches[0]["best"])[_first(record) :]
+
+
+def _first(record: SearchRecord) -> int:
+    """Index of the first shown scene of a path: 1 if the root is an empty scene, 0 if the search started from it."""
+    return 0 if record.settings.get("from_scene") else 1
+
+
+def shown_nodes(record: SearchRecord) -> list[int]:
+    """Ids of the scenes that the page shows: the best path of the first search, then its other best scenes."""
+    path = best_path(record)
+    if len(path) > MAX_PATH_SCENES:
+        path = [path[step] for step in np.linspace(0, len(path) - 1, MAX_PATH_SCENES).round().astype(int)]
+    on_path = set(path)
+    others = [node for node in record.tree_of(0)[1:] if node.value is not None and node.id not in on_path]
+    best = heapq.nsmallest(MAX_OTHER_SCENES, others, key=lambda node: (-(node.value or 0.0), node.id))
+    return path + [node.id for node in best]
+
+
+def write_tree_page(
+    path: Path,
+    record: SearchRecord,
+    scenes: Mapping[int, SceneBatch],
+    metrics: Mapping[str, Any],
+    *,
+    returned: SceneBatch | None = None,
+) -> Path:
+    """Write the page of the first search of ``record``, which works offline and without other files.
+
+    Args:
+        path: HTML file to write.
+        record: record of all scenes.
+        scenes: a batch of one for each id of :func:`shown_nodes`.
+        metrics: contents of ``metrics.json``.
+        returned: scene that the search returned, if it is not a node because the planner changed it at the end.
+    """
+    from jinja2.utils import htmlsafe_json_dumps
+    from markupsafe import Markup
+
+    from scene_envs.render import viewer_page
+
+    shown = list(scenes)
+    way = best_path(record)
+    batch = SceneBatch.concatenate([*scenes.values(), *([] if returned is None else [returned])])
+    tree = record.tree_of(0)
+    number = {node.id: k for k, node in enumerate(tree)}
+    captions = [_caption(record.nodes[node], number, way) for node in shown]
+    if returned is not None:
+        captions.append("the scene that the search returned")
+    cards = _cards(record, shown, way)
+    on_path = set(way)
+    steps = [k for k, node in enumerate(shown) if node in on_path] + ([] if returned is None else [len(shown)])
+    data = {
+        "parent": [-1 if node.parent is None else number[node.parent] for node in tree],
+        "objective": [node.objective for node in tree],
+        "action": [node.action for node in tree],
+        "depth": [node.depth for node in tree],
+        "below": [node.visits for node in tree],
+        "redo": [len(node.mask) for node in tree],
+        "masks": [record.nodes[node].mask for node in shown],
+        "frame": {number[node]: frame for frame, node in enumerate(shown)},
+        "path": [number[node] for node in way],
+        "steps": steps,
+        "name": _words(metrics["objective"]),
+        "baseline": _baseline(metrics),
+        "nfe": record.settings["nfe_per_scene"],
+        "from_scene": not _first(record),
+    }
+    style = "".join(page_part(*place) for place in (("agents.utils", "report.css"), ("agents.planning", "tree.css")))
+    page = page_template("agents.planning", "tree.html", trim_blocks=True).render(
+        style=Markup(style),
+        script=Markup(page_part("agents.planning", "tree.js")),
+        data=htmlsafe_json_dumps(finite(data), separators=(",", ":"), allow_nan=False),
+        viewer=viewer_page(batch, captions=captions, title="The best scenes"),
+        cards=cards,
+        columns=1 + max(card.column for card in cards),
+        rows=1 + max(card.row for card in cards),
+        record=record,
+        metrics=metrics,
+        objective=_words(metrics["objective"]),
+        path_length=record.nodes[record.searches[0]["best"]].depth,
+        from_scene=not _first(record),
+        left_out=sum(node not in scenes for node in way),
+        best_nodes=sum(node not in on_path for node in shown),
+        scene_type=_words(batch.scene_type.name),
+    )
+    write_text(path, page)
+    return path
+
+
+def _cards(record: SearchRecord, shown: Sequence[int], way: Sequence[int]) -> list[Card]:
+    """The cards of the shown scenes and of all their ancestors except an empty root, parents first.
+
+    The best path is in the first row. A chain of first children takes the highest row that is free in all its columns.
+    """
+    frames, on_path = {node: frame for frame, node in enumerate(shown)}, set(way)
+    number = {node.id: k for k, node in enumerate(record.tree_of(0))}
+    children: dict[int | None, list[int]] = {}
+    for each in {ancestor for node in shown for ancestor in record.path(node)[_first(record) :]}:
+        children.setdefault(record.nodes[each].parent, []).append(each)
+    for siblings in children.values():
+        siblings.sort(key=lambda each: (each not in on_path, -(record.nodes[each].value or 0.0), each))
+    cards: list[Card] = []
+    index: dict[int, int] = {}
+    used: dict[int, int] = {}
+    chains = deque(children.get(record.searches[0]["root"] if _first(record) else None, []))
+    while chains:
+        chain = [record.nodes[chains.popleft()]]
+        while below := children.get(chain[-1].id):
+            chain.append(record.nodes[below[0]])
+        first = 0 if chain[0].parent not in index else cards[index[chain[0].parent]].column + 1
+        row = max(used.get(column, 0) for column in range(first, first + len(chain)))
+        for column, node in enumerate(chain, start=first):
+            used[column], parent = row + 1, None if node.parent is None else index.get(node.parent)
+            index[node.id] = len(cards)
+            cards.append(Card(node, column, row, parent, number[node.id], frames.get(node.id), node.id in on_path))
+            chains.extend(children.get(node.id, [])[1:])
+    return cards
+
+
+def _caption(node: TreeNode, number: Mapping[int, int], way: Sequence[int]) -> str:
+    place = f"step {way.index(node.id) + 1} of {len(way)} to the best" if node.id in way else "another good scene"
+    made = "where the search started" if node.parent is None else f"made as no. {number[node.id]}"
+    objective = "not scored" if node.objective is None else f"objective {node.objective:.4g}"
+    return f"{place} · {made} · {objective} · {len(node.mask)} slots to redo"
+
+
+def _baseline(metrics: Mapping[str, Any]) -> list[float | None]:
+    """Best objective of the independent samples after each of them; empty without a baseline."""
+    scale = metrics["objective_scale"]
+    curve = metrics.get("best_of", {}).get("curve", [])
+    return [None if value is None else scale * value for value in curve]
+
+
+def _words(name: object) -> str:
+    return str(name).replace("_", " ")

@@ -1,0 +1,504 @@
+"""Base class of post-training algorithms: the interface that the training loop uses."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Generator, Tensor, nn
+from torchrl.objectives import LossModule
+
+from agents.networks.text import Text
+from agents.post_training.policy import DenoisingPolicy
+from agents.priors.prior import NoisedScenes, ScenePrior
+from agents.utils.process_group import ProcessGroup, gather_rows
+from agents.utils.weight_average import WeightAverage
+from scene_envs.errors import InvalidInputError
+
+SceneLoss = Callable[[NoisedScenes, Text | None], Tensor]
+"""(B,) losses of noised scenes and their prompts."""
+
+
+@dataclass(frozen=True)
+class BatchGradient:
+    """Statistics of the gradient that a batch added to ``.grad``.
+
+    Attributes:
+        loss: value of the objective, over the scenes of all processes.
+        columns: further columns of the log.
+    """
+
+    loss: float
+    columns: Mapping[str, float] = field(default_factory=dict)
+
+    def figures(self) -> Mapping[str, float]:
+        """Further columns of the log."""
+        return self.columns
+
+
+class GradientSum:
+    """Sum of the gradients of parts of a batch, each of which is complete before it is added.
+
+    The sum of two parts is the same, bit for bit, in one process as in two processes with one part each.
+
+    Args:
+        parameters: parameters whose ``.grad`` is summed; a gradient that is there already is the first part.
+
+    >>> weight = nn.Parameter(torch.ones(1))
+    >>> total = GradientSum([weight])
+    >>> for factor in (2.0, 3.0):
+    ...     (factor * weight).sum().backward()
+    ...     total.add_part()
+    >>> total.write()
+    >>> weight.grad
+    tensor([5.])
+    """
+
+    def __init__(self, parameters: Iterable[nn.Parameter]) -> None:
+        self._parameters = [p for p in parameters if p.requires_grad]
+        self._total: list[Tensor | None] = [None] * len(self._parameters)
+        self.add_part()
+
+    def add_part(self) -> None:
+        """Add ``.grad`` to the sum, and clear it."""
+        for index, parameter in enumerate(self._parameters):
+            before, gradient = self._total[index], parameter.grad
+            self._total[index] = before if gradient is None else gradient if before is None else before.add_(gradient)
+            parameter.grad = None
+
+    def write(self) -> None:
+        """Put the sum into ``.grad``."""
+        for parameter, total in zip(self._parameters, self._total, strict=True):
+            parameter.grad = total
+
+
+def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[int], float]:
+    """``count`` distinct steps of positive weight, and the factor that scales their sum to all such steps."""
+    eligible = torch.nonzero(weights > 0).flatten()
+    chosen = eligible[torch.randperm(len(eligible), generator=generator)[:count]]
+    return sorted(chosen.tolist()), len(eligible) / len(chosen)
+
+
+def add_regularisation_gradient(
+    prior: ScenePrior,
+    x0: Tensor,
+    coefficient: float,
+    generator: Generator,
+    *,
+    loss: SceneLoss | None = None,
+    chunk: int | None = None,
+    prompts: Sequence[str] | None = None,
+) -> tuple[float, float]:
+    """Add ``coefficient`` times the gradient of a loss of noised scenes to ``.grad``.
+
+    Args:
+        prior: the prior in training.
+        x0: (B, N, D) normalised scenes of all processes; each process takes its share of them.
+        coefficient: of the loss, which is a mean over scenes and entries.
+        generator: source of timesteps and noise (CPU).
+        loss: (B,) losses of noised scenes; None for the pretraining loss.
+        chunk: scenes per pass.
+        prompts: of the scenes, ``""`` for none; None for a prior that reads none.
+
+    Returns:
+        The mean loss of all scenes, and the norm of ``coefficient`` times its gradient.
+    """
+    if coefficient == 0:
+        return 0.0, 0.0
+    processes, parameters = ProcessGroup.current(), [p for p in prior.parameters() if p.requires_grad]
+    before = [p.grad for p in parameters]
+    for parameter in parameters:
+        parameter.grad = None
+    value, total = 0.0, GradientSum(parameters)
+    noised, own = prior.noised(x0, generator), processes.rows(len(x0))
+    losses = loss or prior.noised_loss
+    size = chunk or len(x0)
+    for start in range(own.start, own.stop, size):
+        rows = slice(start, min(start + size, own.stop))
+        text = None if prompts is None else encoded(prior, prompts[rows])
+        mean = losses(noised.rows(rows), text).mean() * ((rows.stop - start) / len(x0))
+        value += float(mean.detach())
+        (coefficient * mean).backward()
+        total.add_part()
+    total.write()
+    processes.sum_gradients(parameters)
+    norm = gradient_norm(parameters)
+    for parameter, gradient in zip(parameters, before, strict=True):
+        if gradient is not None:
+            parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+    return processes.sum_numbers(value)[0], norm
+
+
+def prompted_loss(prior: ScenePrior, x0: Tensor, prompts: Sequence[str] | None, generator: Generator | None) -> Tensor:
+    """(B,) pretraining losses of real scenes ``x0`` (B, N, D), given their prompts if there are any."""
+    text = None if prompts is None else encoded(prior, prompts)
+    return prior.pretraining_loss(x0, generator, "none", text=text)
+
+
+@torch.no_grad()
+def encoded(prior: ScenePrior, prompts: Sequence[str]) -> Text | None:
+    """Text of ``prompts`` without gradients; None for a prior that reads none."""
+    return prior.encode_prompts(prompts) if prior.conditional else None
+
+
+def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
+    """Euclidean norm of all ``.grad``; 0 when there is none."""
+    norms = [p.grad.norm() for p in parameters if p.grad is not None]
+    return float(torch.stack(norms).norm()) if norms else 0.0
+
+
+class Algorithm(ABC):
+    """Rule that turns a batch of scenes into a gradient.
+
+    Attributes:
+        policy: the reverse chain of the prior in training.
+        advantage: writes what the loss reads into a batch; None where the scenes are not weighted.
+        loss: the loss that is minimised.
+    """
+
+    policy: DenoisingPolicy
+    advantage: TensorDictModuleBase | None = None
+    loss: LossModule
+
+    @property
+    def sampling_policy(self) -> DenoisingPolicy:
+        """Policy that samples the scenes; the policy in training unless an algorithm keeps another."""
+        return self.policy
+
+    @property
+    def average(self) -> WeightAverage | None:
+        """Averaged weights that are evaluated and saved; None evaluates and saves the weights in training."""
+        return None
+
+    @abstractmethod
+    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
+        """Add the gradient of a batch to ``.grad``; everything random is drawn from ``generator`` (CPU).
+
+        The batch [B, S] is that of :func:`~agents.post_training.rollouts.collect`, after :attr:`advantage`. With
+        several processes, each process adds the gradient of its own scenes, as a part of the mean over all scenes. The
+        training loop sums these parts.
+        """
+
+    def end_iteration(self) -> None:
+        """Called after the last update of every batch."""
+        return
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Called after the weights in training were replaced by those of ``prior``, an earlier checkpoint."""
+        return
+
+    def state(self) -> dict[str, Any]:
+        """State that a resumed run needs in addition to the weights in training."""
+        return {}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        return
+
+
+BASELINES = ("leave_one_out", "mean")
+_MIN_STD = 1e-8
+
+
+class Advantage(TensorDictModuleBase):
+    """Writes the advantages of whole episodes [B, S], one episode in each row, at all of their steps.
+
+    Scenes with equal prompts are compared with each other. The steps share the memory of one value per episode.
+
+    Reads:
+        ("next", "reward"), ("next", "done"): (B, S, 1).
+        ("next", "valid"): (B, S, 1) bool, optional; False at the last step where the reward could not score the scene.
+        prompt: (B, S, L) int64 token indices, optional.
+        per_object, credited: (B, S, N) credit per slot, and bool whether the slot has credit, both optional.
+
+    Writes:
+        advantage: (B, S, 1), or (B, S, N) for credit per object.
+        valid: (B, S, 1) bool, whether the reward could score the scene at the end of the episode.
+
+    Args:
+        credit: ``"scene"``, ``"object"``, or ``"auto"`` for credit per object where there is ``per_object``.
+        baseline: baseline of :func:`compute_advantages`.
+        clip: bound of :func:`compute_advantages`.
+
+    Raises:
+        InvalidInputError: a row is not one whole episode, or credit per object is asked of a reward that gives none.
+
+    >>> from tensordict import TensorDict
+    >>> done = torch.tensor([[[False], [True]]]).expand(3, 2, 1)
+    >>> reward = torch.tensor([0.0, 1.0, 5.0])[:, None, None] * done
+    >>> batch = Advantage(baseline="mean")(TensorDict({"next": {"reward": reward, "done": done}}, [3, 2]))
+    >>> batch["advantage"][:, 0, 0]
+    tensor([-0.9258, -0.4629,  1.3887])
+    """
+
+    in_keys = [("next", "reward"), ("next", "done")]  # noqa: RUF012  (torchrl reads lists)
+    out_keys = ["advantage", "valid"]  # noqa: RUF012
+
+    def __init__(self, *, credit: str = "auto", baseline: str = "leave_one_out", clip: float = 5.0) -> None:
+        super().__init__()
+        self.credit, self.baseline, self.clip = credit, baseline, clip
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``out_keys``."""
+        final = last_steps(tensordict)
+        reward, valid = self.credited(final)
+        advantage = compute_advantages(
+            reward, valid, baseline=self.baseline, clip=self.clip, groups=prompt_groups(final)
+        )
+        tensordict["advantage"] = at_all_steps(advantage, tensordict)
+        tensordict["valid"] = at_all_steps(final_reward(final)[1], tensordict)
+        return tensordict
+
+    def credited(self, final: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Rewards and their validity from the last transitions [B]: (B,) with credit per scene, (B, N) per object.
+
+        Raises:
+            InvalidInputError: credit per object is asked of a reward that has no ``per_object``.
+        """
+        reward, valid = final_reward(final)
+        per_object = final.get("per_object", None)
+        if self.credit == "scene" or (self.credit == "auto" and per_object is None):
+            return reward, valid
+        if per_object is None:
+            raise no_credit_per_object()
+        credited = final.get("credited", torch.ones_like(per_object, dtype=torch.bool))
+        return per_object.float(), credited & valid[:, None]
+
+
+def last_steps(episodes: TensorDictBase) -> TensorDictBase:
+    """The last transitions [B] of whole episodes [B, S].
+
+    Raises:
+        InvalidInputError: a row is not one whole episode.
+    """
+    done = episodes["next", "done"][..., 0]
+    if done.ndim != 2 or not bool(done[:, -1].all()) or bool(done[:, :-1].any()):
+        raise InvalidInputError(
+            f"a batch of shape {tuple(episodes.shape)} does not hold one whole episode in each row; give "
+            "env.rollout the number of steps of an episode, and a collector that number times the environments"
+        )
+    return episodes[:, -1]
+
+
+def at_all_steps(values: Tensor, episodes: TensorDictBase) -> Tensor:
+    """``values`` (B,) or (B, K) of B episodes [B, S] as (B, S, 1) or (B, S, K), without a copy."""
+    values = values[:, None] if values.ndim == 1 else values
+    return values[:, None].expand(-1, episodes.shape[1], *values.shape[1:])
+
+
+def final_reward(final: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """Rewards (B,) of episodes from their last transitions [B], and (B,) bool whether the reward could score them."""
+    reward, valid = final["next", "reward"][:, 0], final.get(("next", "valid"), None)
+    return reward, torch.ones_like(reward, dtype=torch.bool) if valid is None else valid[:, 0]
+
+
+def prompt_groups(final: TensorDictBase) -> Tensor | None:
+    """(B,) int64, equal for scenes with equal prompts, over all processes; None where there are no prompts."""
+    prompt = final.get("prompt", None)
+    if prompt is None:
+        return None
+    everywhere = gather_rows(prompt)
+    groups: Tensor = torch.unique(everywhere, dim=0, return_inverse=True)[1]
+    return groups[ProcessGroup.current().rows(len(everywhere))]
+
+
+def no_credit_per_object() -> InvalidInputError:
+    """The error where credit per object is asked of a reward that gives none."""
+    return InvalidInputError(
+        "algorithm.credit=object (credit='object') needs a reward with per_object values, and this one scores scenes "
+        "only; take algorithm.credit=scene, or auto"
+    )
+
+
+def compute_advantages(
+    reward: Tensor,
+    valid: Tensor | None = None,
+    *,
+    baseline: str = "leave_one_out",
+    clip: float = 5.0,
+    groups: Tensor | None = None,
+) -> Tensor:
+    """(reward - baseline) / std, clipped; invalid rows get 0 and are left out of all statistics.
+
+    The std is the population's (divided by n) over the valid rows. The leave-one-out baseline of a row is
+    the mean of the *other* valid rows (Kool et al. 2019), which keeps the gradient unbiased; ``"mean"`` is the
+    mean of all. If ``torch.distributed`` runs, the rows of all workers count.
+
+    Args:
+        reward: (B,) or (B, K) floats; K columns (slots) share one baseline and one std.
+        valid: (B,) or (B, K) bool; None takes all rows as valid.
+        baseline: ``"leave_one_out"`` or ``"mean"``.
+        clip: largest absolute value of an advantage.
+        groups: (B,) int64, such as an index of the prompt; statistics are taken within each group.
+
+    Returns:
+        float32 of the shape of ``reward``; zeros for a group with fewer than two valid entries or no spread.
+
+    >>> compute_advantages(torch.tensor([0.0, 1.0, 5.0]), torch.tensor([True, True, False]), baseline="mean")
+    tensor([-1.,  1.,  0.])
+    """
+    if baseline not in BASELINES:
+        raise InvalidInputError(f"baseline={baseline!r} is not known; use one of {', '.join(BASELINES)}")
+    if not clip > 0:
+        raise InvalidInputError(f"advantage_clip={clip} must be positive")
+    taken = torch.ones_like(reward, dtype=torch.bool) if valid is None else _expand(valid, reward)
+    taken = taken & torch.isfinite(reward)
+    all_rewards, all_taken = gather_rows(reward), gather_rows(taken)
+    if groups is None:
+        return _normalise(reward, taken, all_rewards[all_taken], baseline, clip)
+    all_groups = gather_rows(groups)
+    advantage = torch.zeros_like(reward, dtype=torch.float32)
+    for group in groups.unique():
+        rows, in_group = groups == group, all_groups == group
+        sample = all_rewards[in_group][all_taken[in_group]]
+        advantage[rows] = _normalise(reward[rows], taken[rows], sample, baseline, clip)
+    return advantage
+
+
+def _normalise(reward: Tensor, taken: Tensor, sample: Tensor, baseline: str, clip: float) -> Tensor:
+    """Advantages of ``reward`` against the valid rewards ``sample`` (M,)."""
+    count = sample.numel()
+    zeros = torch.zeros_like(reward, dtype=torch.float32)
+    if count < 2:
+        return zeros
+    values = sample.double()
+    std = values.std(unbiased=False)
+    if std <= _MIN_STD:
+        return zeros
+    deviation = (torch.where(taken, reward, zeros).double() - values.mean()) / std
+    if baseline == "leave_one_out":  # r - mean of the others = (r - mean of all) n / (n - 1)
+        deviation = deviation * (count / (count - 1))
+    return torch.where(taken, deviation.clamp(-clip, clip).float(), zeros)
+
+
+def _expand(valid: Tensor, reward: Tensor) -> Tensor:
+    while valid.ndim < reward.ndim:
+        valid = valid.unsqueeze(-1)
+    return valid.expand(reward.shape)
+
+
+class AveragedSampler(Algorithm):
+    """An algorithm that samples with a separate copy of the prior, whose weights are also evaluated and saved.
+
+    After each batch the copy moves towards the prior in training.
+
+    Args:
+        policy: policy that is optimised.
+        sampler_decay: final decay, per batch, of the weight average that samples.
+        warm_up: warm-up of the decay, see :class:`~agents.utils.weight_average.WeightAverage`.
+
+    Attributes:
+        prior: the prior in training.
+        sampler: the prior that samples.
+    """
+
+    def __init__(self, policy: DenoisingPolicy, *, sampler_decay: float, warm_up: float = 10.0) -> None:
+        self.policy = policy
+        self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
+        self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
+        self._sampling_policy = DenoisingPolicy(
+            self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance,
+            claim_guidance=policy.claim_guidance, independent=False,
+        )  # fmt: skip  # it needs no log-probabilities
+        self._average = WeightAverage(self.prior, sampler_decay, warm_up)
+
+    @property
+    def sampling_policy(self) -> DenoisingPolicy:
+        """The reverse chain of the copy that samples."""
+        return self._sampling_policy
+
+    @property
+    def average(self) -> WeightAverage:
+        """The weights of the copy that samples."""
+        return self._average
+
+    def end_iteration(self) -> None:
+        """Move the copy towards the prior in training."""
+        self._average.update(self.prior)
+        self._average.copy_to(self.sampler)
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Sample with the weights of ``prior``, and begin their average anew."""
+        self._average = WeightAverage(prior, self._average.decay, self._average.warm_up)
+        self._average.copy_to(self.sampler)
+
+    def state(self) -> dict[str, Any]:
+        """The weights of the copy, and the number of their updates."""
+        return {"sampler": self._average.tensors, "updates": self._average.updates}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        self._average.restore(state["sampler"], state["updates"])
+        self._average.copy_to(self.sampler)
+
+
+class Expectation(nn.Module):
+    """Mean target of a denoiser at a noised scene, over the scenes that the sampling policy makes.
+
+    A forward-process loss attracts the output to the targets of good samples, repels it from the targets of bad
+    samples, and takes the output of the sampling policy as the mean target. This output is not the mean, because a
+    policy in training is not an exact denoiser of its own samples. Where all samples are bad, the difference repels the
+    output, the sampling policy follows, and the difference grows. This copy of the denoiser learns the mean. Only the
+    covariance of target and advantage is then left, as in a policy gradient with an exact baseline.
+
+    Args:
+        prior: prior from which the denoiser is copied.
+        learning_rate: learning rate of AdamW.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="mixed")
+    >>> noised = prior.noised(prior.encode(prior.sample(2, num_steps=3)))
+    >>> expectation = Expectation(prior)
+    >>> bool((expectation(noised) == prior.output(noised).continuous).all())
+    True
+    """
+
+    def __init__(self, prior: ScenePrior, learning_rate: float = 3e-4) -> None:
+        super().__init__()
+        self.prior = deepcopy(prior).requires_grad_(True)
+        self.prior.freeze_text()
+        self.trained = [p for p in self.prior.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.AdamW(self.trained, lr=learning_rate, weight_decay=0.0)
+
+    def forward(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+        """(B, N, F) expected targets."""
+        return self.prior.output(noised, text).continuous
+
+    def step(self, clip: float = 1.0) -> None:
+        """Apply the gradient that all processes accumulated; one that is not finite is dropped."""
+        ProcessGroup.current().sum_gradients(self.trained)
+        if bool(torch.isfinite(nn.utils.clip_grad_norm_(self.trained, clip))):
+            self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Take the weights of ``prior``, and forget the optimiser's state."""
+        self.prior.load_state_dict(prior.state_dict())
+        self.optimizer.state.clear()
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"weights": self.prior.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        self.prior.load_state_dict(state["weights"])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+
+class PlainLoss(LossModule):
+    """A torchrl loss whose gradient goes to the modules' own parameters, and which has no value estimator."""
+
+    @property
+    def functional(self) -> bool:
+        """False: the modules' own parameters receive the gradient."""
+        return False
+
+    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
+        """Do nothing, because there is no value estimator."""

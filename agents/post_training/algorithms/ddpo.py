@@ -1,0 +1,277 @@
+"""DDPO on a denoising policy: advantages, loss and gradient of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.utils import NestedKey
+from torch import Generator, Tensor
+
+from agents.post_training.algorithms.base import Advantage, Algorithm, BatchGradient, GradientSum, PlainLoss, draw_steps
+from agents.post_training.policy import DenoisingPolicy, gradient_weights
+from agents.post_training.settings import DDPOISSettings, DDPOSFSettings
+from agents.utils.process_group import ProcessGroup
+from scene_envs.errors import InvalidInputError
+
+REDUCTIONS = ("sum", "mean")
+
+
+class DDPOSFLoss(PlainLoss):
+    """Denoising diffusion policy optimisation (Black et al. 2024), Eq. 3 (score function) or Eq. 4 (clipped).
+
+    For transitions (x_t, t, x_{t-1}) with advantage A, the loss is
+
+        - mean over valid rows of  weight(t) * A * log p(x_{t-1} | x_t)
+
+    where x_t and x_{t-1} are constants, so the gradient is that of the score function. The graph of one step can be
+    freed before the next is built, so memory does not grow with the length of the chain. Known entries, the
+    deterministic last step and steps of weight 0 do not enter the loss.
+
+    With ``clip_epsilon``, ``min(ratio * A, clip(ratio, 1 ± epsilon) * A)`` replaces A * log p. The ratio is that of the
+    *reduced* probabilities to those stored at sampling; before the first update it is exactly 1.
+
+    The reduction of log p over the entries of a scene is ``"sum"`` (the log-probability itself) or ``"mean"`` (divided
+    by the number of random entries, as in the published code). It decides the scale of the gradient, and so the
+    meaning of the coefficient of any other loss. Over rows the loss is always a mean, never over steps.
+
+    Accepted keys (``set_keys``):
+        scene: (B, N, D) float, x_t. Default ``"scene"``.
+        timestep: (B, 1) int64, t. Default ``"timestep"``.
+        action: (B, N, D) float, x_{t-1}. Default ``"action"``.
+        advantage: (B,) or (B, 1) float, or (B, N) for credit per slot. Default ``"advantage"``.
+        sample_log_prob: (B, N) float, log-probability per slot at sampling; read when clipping, and optional
+            without. Default ``"slot_log_prob"``.
+        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``. If
+            ``("next", valid)`` is present, as in the output of a collector, the whole episode of a scene that the
+            reward could not score is left out. Rows must then be transitions in order along the last dimension, and
+            ``("next", "done")`` marks where an episode ends.
+        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional, as the policy saw them. Default ``"text"``
+            and ``"text_mask"``.
+        prompt: (B, L) int64 token indices, optional, read where ``text`` is missing. Default ``"prompt"``.
+
+    Args:
+        policy: policy that is optimised.
+        step_weights: (S,) weight of every step; None means 1 wherever the step is random.
+        reduction: ``"sum"`` or ``"mean"`` of log p over the random entries of a scene.
+        clip_epsilon: half-width of the ratio's clip, or None for the plain score function.
+
+    Returns (``forward``): ``loss_objective`` (), and detached ``log_ratio`` (), the largest |log ratio|, and
+    ``clip_fraction`` (); both are 0 where no old log-probabilities are given.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> policy = DenoisingPolicy(tiny_prior(), num_steps=4)
+    >>> scene = policy.prior.initial(2, 34)
+    >>> action, log_prob = policy.draw(scene, 1)
+    >>> transitions = TensorDict({"scene": scene, "timestep": policy.table.timesteps[1].expand(2, 1),
+    ...     "action": action, "advantage": torch.tensor([1.0, -1.0]), "slot_log_prob": log_prob}, [2])
+    >>> loss = DDPOSFLoss(policy)(transitions)
+    >>> sorted(loss.keys()), float(loss["log_ratio"])
+    (['clip_fraction', 'log_ratio', 'loss_objective'], 0.0)
+    >>> loss["loss_objective"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        scene: NestedKey = "scene"
+        timestep: NestedKey = "timestep"
+        action: NestedKey = "action"
+        advantage: NestedKey = "advantage"
+        sample_log_prob: NestedKey = "slot_log_prob"
+        valid: NestedKey = "valid"
+        text: NestedKey = "text"
+        text_mask: NestedKey = "text_mask"
+        prompt: NestedKey = "prompt"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_objective", "log_ratio", "clip_fraction"]  # noqa: RUF012  (torchrl reads lists)
+    policy: DenoisingPolicy
+    step_weights: Tensor
+
+    def __init__(
+        self,
+        policy: DenoisingPolicy,
+        *,
+        step_weights: Tensor | None = None,
+        reduction: str = "sum",
+        clip_epsilon: float | None = None,
+    ) -> None:
+        super().__init__()
+        if reduction not in REDUCTIONS:
+            raise InvalidInputError(f"reduction={reduction!r} is not known; use 'sum' or 'mean'")
+        if clip_epsilon is not None and not 0 < clip_epsilon < 1:
+            raise InvalidInputError(f"clip_epsilon={clip_epsilon} must lie between 0 and 1, or be None")
+        if step_weights is not None and step_weights.shape != (len(policy),):
+            raise InvalidInputError(
+                f"step_weights has shape {tuple(step_weights.shape)}, the chain {len(policy)} steps"
+            )
+        self.policy = policy
+        self.reduction = reduction
+        self.clip_epsilon = clip_epsilon
+        weights = torch.ones(len(policy)) if step_weights is None else step_weights.float()
+        self.register_buffer("step_weights", weights)
+        self._entries: dict[int, int] = {}
+
+    @property
+    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
+        """Keys that must be present."""
+        keys = self.tensor_keys
+        return [keys.scene, keys.timestep, keys.action, keys.advantage]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss of a batch of transitions; rows may be at different steps.
+
+        Raises:
+            InvalidInputError: a timestep the policy does not visit, or clipping without old log-probabilities.
+        """
+        keys = self.tensor_keys
+        flat = tensordict.reshape(-1)
+        scene, action = flat.get(keys.scene).detach(), flat.get(keys.action).detach()
+        timestep = flat.get(keys.timestep).reshape(-1)
+        advantage = self._advantage(flat, scene.shape[:2])
+        old = flat.get(keys.sample_log_prob, None)
+        if old is None and self.clip_epsilon is not None:
+            raise InvalidInputError(f"clipping needs the log-probabilities at sampling under {keys.sample_log_prob!r}")
+        kept = self._kept(tensordict)
+        text = self._text(flat)
+        total = scene.new_zeros(())
+        largest, clipped = scene.new_zeros(()), scene.new_zeros(())
+        for t in timestep.unique().tolist():
+            rows = timestep == t
+            step = self.policy.step_of(int(t))
+            part_text = None if text is None else (text[0][rows], text[1][rows])
+            log_prob = self.policy.log_prob(scene[rows], step, action[rows], part_text)  # (b, N)
+            earlier = None if old is None else old[rows].detach()
+            if earlier is not None:
+                largest = torch.maximum(largest, (log_prob.detach() - earlier).sum(dim=-1).abs().max())
+            objective, beyond = self._objective(log_prob, advantage[rows], earlier)
+            total = total + self.step_weights[step] * torch.where(kept[rows], objective, 0.0).sum()
+            clipped = clipped + torch.where(kept[rows], beyond, 0.0).sum()
+        count = kept.sum().clamp(min=1)
+        return TensorDict(
+            {"loss_objective": -total / count, "log_ratio": largest, "clip_fraction": clipped / count}, []
+        )
+
+    def _objective(self, log_prob: Tensor, advantage: Tensor, old: Tensor | None) -> tuple[Tensor, Tensor]:
+        """(b,) objective and (b,) share of clipped terms, from (b, N) log-probabilities and advantages."""
+        entries = self._count_entries(log_prob.shape[1])
+        if advantage.shape[1] == 1:  # credit per scene
+            log_prob = log_prob.sum(dim=1, keepdim=True)
+            old = None if old is None else old.sum(dim=1, keepdim=True)
+        log_prob = log_prob / entries
+        if self.clip_epsilon is None or old is None:
+            return (advantage * log_prob).sum(dim=1), torch.zeros_like(advantage[:, 0])
+        ratio = (log_prob - old / entries).exp()
+        bounded = ratio.clamp(1 - self.clip_epsilon, 1 + self.clip_epsilon)
+        surrogate = torch.minimum(ratio * advantage, bounded * advantage)
+        return surrogate.sum(dim=1), (ratio != bounded).float().mean(dim=1).detach()
+
+    def _kept(self, tensordict: TensorDictBase) -> Tensor:
+        """(rows,) bool: transitions of scenes that the reward could score."""
+        shape, key = tensordict.batch_size, self.tensor_keys.valid
+        here, after = tensordict.get(key, None), tensordict.get(unravel_key(("next", key)), None)
+        kept = torch.ones(shape, dtype=torch.bool, device=tensordict.get(self.tensor_keys.scene).device)
+        if here is not None:
+            kept = kept & here.reshape(shape)
+        if after is None:
+            return kept.reshape(-1)
+        episode = after.reshape(shape).clone()
+        done = tensordict.get(("next", "done"), None)
+        if done is not None and len(shape) > 1:
+            ends = done.reshape(shape)
+            for step in reversed(range(shape[-1] - 1)):
+                episode[..., step] &= ends[..., step] | episode[..., step + 1]
+        return (kept & episode).reshape(-1)
+
+    def _text(self, flat: TensorDictBase) -> tuple[Tensor, Tensor] | None:
+        keys = self.tensor_keys
+        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
+        if tokens is not None and mask is not None:
+            return tokens.detach(), mask
+        prompt = flat.get(keys.prompt, None)
+        return None if prompt is None else self.policy.read(prompt)
+
+    def _advantage(self, flat: TensorDictBase, shape: torch.Size) -> Tensor:
+        advantage = flat.get(self.tensor_keys.advantage).detach()
+        advantage = advantage.reshape(shape[0], -1)
+        if advantage.shape[1] not in (1, shape[1]):
+            raise InvalidInputError(
+                f"the advantage has {advantage.shape[1]} values per scene; give one, or one per slot ({shape[1]})"
+            )
+        return advantage
+
+    def _count_entries(self, slots: int) -> int:
+        """Divisor of log-probabilities."""
+        if self.reduction != "mean":
+            return 1
+        if slots not in self._entries:
+            self._entries[slots] = self.policy.random_entries(slots)
+        return self._entries[slots]
+
+
+class DDPO(Algorithm):
+    """DDPO-SF, or DDPO-IS if given the settings of DDPO-IS (Black et al. 2024).
+
+    Args:
+        settings: settings of the algorithm.
+        policy: policy that is optimised.
+        stds: (S,) smallest sigma of every step, normalised units.
+
+    Attributes:
+        loss: loss of a batch of transitions; its ``step_weights`` (S,) say which steps enter the gradient.
+    """
+
+    loss: DDPOSFLoss
+
+    def __init__(self, settings: DDPOSFSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
+        self.settings, self.policy = settings, policy
+        self.advantage = Advantage(credit=settings.credit)
+        weights = gradient_weights(stds, min_std=settings.min_std)
+        clip = settings.clip_epsilon if isinstance(settings, DDPOISSettings) else None
+        self.loss = DDPOSFLoss(policy, step_weights=weights, reduction="mean", clip_epsilon=clip).to(
+            next(policy.parameters()).device
+        )
+
+    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
+        """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that enter it."""
+        steps, scale = draw_steps(self.loss.step_weights.cpu(), self.settings.gradient_steps, generator)
+        return accumulate_policy_gradient(self.loss, batch, steps, scale=scale)
+
+
+def accumulate_policy_gradient(
+    loss: DDPOSFLoss, batch: TensorDictBase, steps: Sequence[int], *, scale: float = 1.0
+) -> BatchGradient:
+    """Add the policy gradient of a batch to ``.grad``, one chunk of scenes and one step at a time.
+
+    The graph of a step is freed after the step, so memory does not depend on the number of steps. With several
+    processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
+
+    Args:
+        loss: the objective; its policy's ``chunk`` bounds the scenes per pass.
+        batch: whole episodes [B, S] with what the loss reads.
+        steps: indices of the steps in the gradient.
+        scale: factor on the sum over ``steps``.
+    """
+    total, largest, clipped = 0.0, 0.0, 0.0
+    valid = batch["valid"][:, -1, 0]
+    size = loss.policy.chunk or len(valid)
+    processes = ProcessGroup.current()
+    valid_count = max(1.0, processes.sum_numbers(int(valid.sum()))[0])
+    gradient = GradientSum(loss.policy.parameters())
+    for start in range(0, len(valid), size):
+        rows = slice(start, min(start + size, len(valid)))
+        share = int(valid[rows].sum()) / valid_count  # turns a chunk's mean into its part of the batch's mean
+        for step in steps if share else ():
+            result = loss(batch[rows, step])
+            objective = result["loss_objective"] * (scale * share)
+            objective.backward()
+            total += float(objective.detach())
+            largest = max(largest, float(result["log_ratio"]))
+            clipped += float(result["clip_fraction"]) * share / len(steps)
+        gradient.add_part()
+    gradient.write()
+    total, clipped = processes.sum_numbers(total, clipped)
+    return BatchGradient(total, {"log_ratio": processes.largest(largest), "clip_fraction": clipped})

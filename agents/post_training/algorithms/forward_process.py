@@ -1,0 +1,503 @@
+"""Forward-process algorithms: sampling policy, advantages, and gradient of a batch."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Generator, Tensor
+from torch.nn import functional as F
+
+from agents.networks.text import Text
+from agents.post_training.algorithms.base import (
+    Advantage,
+    AveragedSampler,
+    BatchGradient,
+    Expectation,
+    GradientSum,
+    PlainLoss,
+    at_all_steps,
+    compute_advantages,
+    final_reward,
+    prompt_groups,
+)
+from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.rollouts import finished_scenes
+from agents.post_training.settings import AWMSettings, NFTSettings
+from agents.priors.prior import NoisedScenes, ScenePrior
+from agents.utils.process_group import ProcessGroup, gather_rows
+from scene_envs.errors import InvalidInputError
+
+
+class OwnSampleLoss(PlainLoss):
+    """A loss of finished scenes x_0; each call noises every scene once.
+
+    A subclass defines the losses of noised scenes. :meth:`forward` returns their means over the valid scenes.
+
+    Accepted keys (``set_keys``):
+        scene: (B, N, D) float, finished scenes x_0 as the prior encodes them. Default ``"scene"``.
+        timestep: (B,) or (B, 1) int64, optional; without it, drawn as in pretraining. Default ``"timestep"``.
+        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
+        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
+
+    Args:
+        prior: prior that noises the scenes.
+        generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
+
+    Returns (``forward``): ``loss_objective`` (), the loss of the prior in training, and ``loss_expectation`` (), the
+        loss of a trained copy of it. Each is 0 if the scenes do not train that model.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        scene: NestedKey = "scene"
+        timestep: NestedKey = "timestep"
+        valid: NestedKey = "valid"
+        text: NestedKey = "text"
+        text_mask: NestedKey = "text_mask"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_objective", "loss_expectation"]  # noqa: RUF012  (torchrl reads lists)
+    prior: ScenePrior
+    generator: Generator | None
+
+    def __init__(self, prior: ScenePrior, *, generator: Generator | None = None) -> None:
+        super().__init__()
+        self.prior = prior
+        self.generator = generator
+
+    @property
+    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
+        """Keys that must be present."""
+        return [self.tensor_keys.scene]
+
+    @abstractmethod
+    def of_scenes(self, noised: NoisedScenes, text: Text | None, flat: TensorDictBase) -> Mapping[str, Tensor]:
+        """Values of ``out_keys``: (B,) with one per scene, or () for a value that is not a mean over scenes."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss of a batch of finished scenes."""
+        flat = tensordict.reshape(-1)
+        timestep = flat.get(self.tensor_keys.timestep, None)
+        scene = flat.get(self.tensor_keys.scene).detach()
+        t = None if timestep is None else timestep.reshape(-1)
+        return self.of_noised(self.prior.noised(scene, self.generator, t), flat)
+
+    def of_noised(self, noised: NoisedScenes, flat: TensorDictBase) -> TensorDict:
+        """The loss of a batch of shape [B] whose scenes the prior has noised already."""
+        keys = self.tensor_keys
+        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
+        text = None if tokens is None or mask is None else (tokens.detach(), mask)
+        scene, valid = flat.get(keys.scene), flat.get(keys.valid, None)
+        kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device) if valid is None else valid.reshape(-1)
+        count = kept.sum().clamp(min=1)
+        found = {
+            name: torch.where(kept, value, 0.0).sum() / count if value.ndim else value
+            for name, value in self.of_scenes(noised, text, flat).items()
+        }
+        return TensorDict(found, [])
+
+
+class ForwardProcessLoss(OwnSampleLoss):
+    """A loss of finished scenes x_0 at random timesteps of the forward process, weighted by their advantages.
+
+    Every scene is noised once per call. o is the output of the trained denoiser, and o_old that of the sampling policy.
+    A subclass defines the loss of an entry, given the advantage of its slot. Squared errors are weighted and reduced as
+    in pretraining: a mean over the entries of a scene, then over the valid scenes. Losses of categories are a mean over
+    the slots whose category is masked at that timestep, times the prior's ``category_weight``.
+
+    The error of a sample is its target minus the mean target of own samples at that noised scene. ``expectation``
+    learns this mean. Without it, o_old replaces the mean, and drifts where all samples are bad.
+
+    ``advantage`` weights the losses of poses, ``category_advantage`` those of categories. Each is one number per scene
+    or one per slot. The network denoises every slot given the others, so an advantage per slot credits an object only
+    for its own pose.
+
+    Accepted keys (``set_keys``), and those of :class:`~agents.post_training.algorithms.forward_process.OwnSampleLoss`:
+        advantage: (B,), (B, 1) or (B, N) float, for poses. Default ``"advantage"``.
+        category_advantage: advantage for categories, of the same shapes, optional; without it categories have no
+            credit. Default ``"category_advantage"``.
+
+    Args:
+        prior: prior that is trained.
+        sampler: prior that sampled the scenes, such as a slower copy of ``prior``; its weights get no gradient.
+        expectation: mean of the targets over own samples, trained by ``loss_expectation``; None takes o_old instead.
+        generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
+
+    Returns (``forward``): ``loss_objective`` (); ``loss_expectation`` (), the pretraining loss of ``expectation`` on
+        the scenes, or 0 without it; and detached ``distance`` (), the root mean square of o - o_old.
+    """
+
+    @dataclass
+    class _AcceptedKeys(OwnSampleLoss._AcceptedKeys):
+        advantage: NestedKey = "advantage"
+        category_advantage: NestedKey = "category_advantage"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_objective", "loss_expectation", "distance"]  # noqa: RUF012  (torchrl reads lists)
+
+    def __init__(
+        self,
+        prior: ScenePrior,
+        sampler: ScenePrior,
+        *,
+        expectation: Expectation | None = None,
+        generator: Generator | None = None,
+    ) -> None:
+        super().__init__(prior, generator=generator)
+        self.expectation = expectation
+        self._sampler = (sampler,)  # in a tuple: its parameters are not parameters of the loss
+
+    @property
+    def sampler(self) -> ScenePrior:
+        """The prior that sampled the scenes."""
+        return self._sampler[0]
+
+    @property
+    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
+        """Keys that must be present."""
+        return [*super().in_keys, self.tensor_keys.advantage]
+
+    @abstractmethod
+    def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
+        """Losses of continuous entries; all arguments broadcast to (B, N, F).
+
+        Args:
+            output: output o of the denoiser in training.
+            old: output o_old of the sampling policy, a constant.
+            target: training target of the denoiser's output for this noise.
+            advantage: advantage of each entry's slot.
+        """
+
+    @abstractmethod
+    def category_loss(self, logits: Tensor, old: Tensor, category: Tensor, advantage: Tensor) -> Tensor:
+        """(B, N) losses of categories.
+
+        Args:
+            logits: (B, N, K) logits of the denoiser in training.
+            old: (B, N, K) logits of the sampling policy, constants.
+            category: (B, N) int64, the clean categories.
+            advantage: (B, 1) or (B, N) advantages.
+        """
+
+    def of_noised(self, noised: NoisedScenes, flat: TensorDictBase) -> TensorDict:
+        """The loss of a batch of shape [B] whose scenes the prior has noised already.
+
+        Raises:
+            InvalidInputError: an advantage has neither one value per scene nor one per slot.
+        """
+        found = super().of_noised(noised, flat)
+        found["distance"] = found["distance"].sqrt()
+        return found
+
+    def of_scenes(self, noised: NoisedScenes, text: Text | None, flat: TensorDictBase) -> Mapping[str, Tensor]:
+        """(B,) losses, (B,) those of the expectation, and (B,) mean squares of o - o_old."""
+        scene = flat.get(self.tensor_keys.scene)
+        advantage = self._advantage(flat, self.tensor_keys.advantage, scene)
+        credit = self._advantage(flat, self.tensor_keys.category_advantage, scene)
+        output = self.prior.output(noised, text)
+        with torch.no_grad():
+            old = self.sampler.output(noised, text)
+        features, poses = output.continuous.shape[-1], self.prior.pose_width
+        of_entries = advantage[..., None].expand(-1, output.continuous.shape[1], features)
+        if features > poses:  # a continuous prior: categories are entries, too
+            of_entries = torch.cat(
+                [of_entries[..., :poses], credit[..., None].expand(*of_entries.shape[:2], features - poses)], dim=-1
+            )
+        weight = noised.weight / noised.weight.sum(dim=(1, 2), keepdim=True).clamp(min=1.0)
+        target, expectation = noised.target, weight.new_zeros(len(weight))
+        if self.expectation is not None:
+            expected = self.expectation(noised, text)
+            expectation = ((expected - target).square() * weight).sum(dim=(1, 2)) * noised.scale
+            target = old.continuous + target - expected.detach()
+        entries = self.continuous_loss(output.continuous, old.continuous, target, of_entries)
+        losses = (entries * weight).sum(dim=(1, 2)) * noised.scale
+        distance = ((output.continuous - old.continuous).detach().square() * weight).sum(dim=(1, 2))
+        if output.logits is not None and old.logits is not None and noised.drawn is not None:
+            slots = self.category_loss(output.logits, old.logits, noised.category, credit)
+            mean = (slots * noised.drawn).sum(dim=1) / noised.drawn.sum(dim=1).clamp(min=1.0)
+            losses = losses + self.prior.config.category_weight * mean
+        return {"loss_objective": losses, "loss_expectation": expectation, "distance": distance}
+
+    def _advantage(self, flat: TensorDictBase, key: NestedKey, scene: Tensor) -> Tensor:
+        """(B, 1) or (B, N); zeros where the key is missing."""
+        found = flat.get(key, None)
+        if found is None:
+            return scene.new_zeros(len(scene), 1)
+        found = found.detach().reshape(len(scene), -1)
+        if found.shape[1] not in (1, scene.shape[1]):
+            raise InvalidInputError(
+                f"{key!r} has {found.shape[1]} values per scene; give one, or one per slot ({scene.shape[1]})"
+            )
+        return found
+
+
+class NFTLoss(ForwardProcessLoss):
+    """Negative-aware fine-tuning (Zheng et al. 2025, arXiv 2509.16117), for poses and, on logits, for categories.
+
+    With the optimality r = 1/2 + clip(A / c, -1, 1) / 2 and the implicit policies
+
+        o_plus = (1 - beta) o_old + beta o,    o_minus = (1 + beta) o_old - beta o
+
+    the loss is r |o_plus - target|^2 + (1 - r) |o_minus - target|^2. Its minimum over o at one x_t is
+    o_old + E[(2 r - 1) (target - o_old)] / beta. The step is thus at most the mean absolute error of o_old divided by
+    beta. The category loss has the same form, with cross-entropies of the logits l_plus and l_minus. These combine
+    logits in the way that o_plus and o_minus combine outputs.
+
+    Args:
+        prior, sampler, expectation, generator: the arguments of :class:`ForwardProcessLoss`.
+        beta: strength; smaller values step further from the sampling policy.
+        clip: c, the advantage at which a sample is fully good or bad.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> import torch
+    >>> from tensordict import TensorDict
+    >>> prior = tiny_prior("dimsum_table", process="mixed")
+    >>> scenes = TensorDict({"scene": prior.encode(prior.sample(2, num_steps=3)), "advantage": torch.ones(2, 34)}, [2])
+    >>> loss = NFTLoss(prior, prior)(scenes)
+    >>> sorted(loss.keys()), float(loss["distance"])
+    (['distance', 'loss_expectation', 'loss_objective'], 0.0)
+    >>> loss["loss_objective"].backward()
+    """
+
+    def __init__(
+        self,
+        prior: ScenePrior,
+        sampler: ScenePrior,
+        *,
+        beta: float = 0.5,
+        clip: float = 1.0,
+        expectation: Expectation | None = None,
+        generator: Generator | None = None,
+    ) -> None:
+        super().__init__(prior, sampler, expectation=expectation, generator=generator)
+        _require_positive(beta=beta, clip=clip)
+        self.beta, self.clip = beta, clip
+
+    def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
+        """See :class:`ForwardProcessLoss`."""
+        good = self.optimality(advantage)
+        change, error = self.beta * (output - old), target - old
+        return good * (change - error).square() + (1 - good) * (change + error).square()
+
+    def category_loss(self, logits: Tensor, old: Tensor, category: Tensor, advantage: Tensor) -> Tensor:
+        """See :class:`ForwardProcessLoss`."""
+        good = self.optimality(advantage)
+        change = self.beta * (logits - old)
+        return good * _cross_entropy(old + change, category) + (1 - good) * _cross_entropy(old - change, category)
+
+    def optimality(self, advantage: Tensor) -> Tensor:
+        """The optimality r of an advantage, in [0, 1]."""
+        return 0.5 + 0.5 * (advantage / self.clip).clamp(-1.0, 1.0)
+
+
+class AWMLoss(ForwardProcessLoss):
+    """Advantage weighted matching (Xue et al. 2025, arXiv 2509.25050) with a pull to the sampling policy.
+
+    With a = clip(A / c, -1, 1), the loss of a continuous entry is a |o - target|^2 + beta |o - o_old|^2. This loss is
+    bounded below for beta > 1. The loss of a category is a times its cross-entropy plus beta KL(p_old || p). For a bad
+    sample it is bounded below if beta times p_old of the category exceeds -a. At o = o_old the gradient is that of
+    :class:`NFTLoss` divided by the beta of :class:`NFTLoss`.
+
+    Args:
+        prior, sampler, expectation, generator: the arguments of :class:`ForwardProcessLoss`.
+        beta: strength of the pull, above 1.
+        clip: c, the largest advantage.
+    """
+
+    def __init__(
+        self,
+        prior: ScenePrior,
+        sampler: ScenePrior,
+        *,
+        beta: float = 2.0,
+        clip: float = 1.0,
+        expectation: Expectation | None = None,
+        generator: Generator | None = None,
+    ) -> None:
+        super().__init__(prior, sampler, expectation=expectation, generator=generator)
+        _require_positive(clip=clip)
+        if not beta > 1:
+            raise InvalidInputError(f"beta={beta} must be above 1: below, a bad sample pushes without bound")
+        self.beta, self.clip = beta, clip
+
+    def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
+        """See :class:`ForwardProcessLoss`."""
+        bounded = (advantage / self.clip).clamp(-1.0, 1.0)
+        return bounded * (output - target).square() + self.beta * (output - old).square()
+
+    def category_loss(self, logits: Tensor, old: Tensor, category: Tensor, advantage: Tensor) -> Tensor:
+        """See :class:`ForwardProcessLoss`."""
+        bounded = (advantage / self.clip).clamp(-1.0, 1.0)
+        pull = F.kl_div(logits.log_softmax(-1), old.log_softmax(-1), reduction="none", log_target=True).sum(dim=-1)
+        return bounded * _cross_entropy(logits, category) + self.beta * pull
+
+
+def _cross_entropy(logits: Tensor, category: Tensor) -> Tensor:
+    return F.cross_entropy(logits.flatten(0, 1), category.flatten(), reduction="none").view(category.shape)
+
+
+def _require_positive(**values: float) -> None:
+    for name, value in values.items():
+        if not value > 0:
+            raise InvalidInputError(f"{name}={value} must be positive")
+
+
+class OwnSampleAlgorithm(AveragedSampler):
+    """Algorithm that trains on the finished scenes of an averaged sampler.
+
+    Args:
+        policy: policy that is optimised.
+        draws: number of timesteps and noises of every scene per update.
+        sampler_decay: decay, per :meth:`WeightAverage.update`, of the weight average that samples.
+
+    Attributes:
+        copy: copy of the denoiser that is trained on the samples with ``loss_expectation``; None for none.
+    """
+
+    loss: OwnSampleLoss
+    copy: Expectation | None
+
+    def __init__(self, policy: DenoisingPolicy, *, draws: int, sampler_decay: float) -> None:
+        super().__init__(policy, sampler_decay=sampler_decay)
+        self.draws = draws
+
+    def measure(self, result: TensorDict) -> dict[str, float]:
+        """Figures of a part of the batch, from ``result``, the loss of this part."""
+        return {}
+
+    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
+        """Add the gradient of a batch to ``.grad``: ``draws`` timesteps and noises of every scene.
+
+        With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
+        """
+        x0 = self.prior.encode(finished_scenes(batch).to(self.prior.device))
+        scenes = batch.exclude("next", "timestep")[:, -1].set("scene", x0)
+        size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
+        valid = max(1.0, processes.sum_numbers(int(scenes["valid"].sum()))[0])
+        everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
+        draws = [self.prior.noised(everything, generator).rows(own) for _ in range(self.draws)]
+        total, sums = 0.0, defaultdict[str, float](float)
+        learned = [] if self.copy is None else self.copy.trained
+        gradient = GradientSum([*self.prior.parameters(), *learned])
+        for start in range(0, len(x0), size):
+            rows = slice(start, start + size)
+            part = scenes[rows]
+            share = int(part["valid"].sum()) / valid / self.draws
+            for noised in draws:
+                result = self.loss.of_noised(noised.rows(rows), part)
+                objective = result["loss_objective"] * share
+                (objective + result["loss_expectation"] * share).backward()
+                total += float(objective.detach())
+                for name, value in self.measure(result).items():
+                    sums[name] += share * value
+            gradient.add_part()
+        gradient.write()
+        if self.copy is not None:
+            self.copy.step()
+        total, *means = processes.sum_numbers(total, *sums.values())
+        return BatchGradient(total, dict(zip(sums, means, strict=True)))
+
+
+class ForwardAdvantage(Advantage):
+    """Writes advantages that are not clipped, of poses and of categories.
+
+    Reads, in addition to the keys of :class:`Advantage`:
+        judged: (B, S, N) bool, optional. Slots that the reward does not judge have no advantage of their own: a table
+            of credit 0 would otherwise be repelled like an object that is not feasible.
+        counts_objects: (B, S, 1) bool, optional, whether the reward depends on which objects there are.
+
+    Writes, in addition:
+        category_advantage: (B, S, 1), the scene's advantage, or zeros for no credit.
+
+    Args:
+        credit: ``"scene"``, ``"object"`` or ``"auto"``, for poses.
+        category_credit: ``"scene"``, ``"none"``, or ``"auto"``: none where poses have credit per object and the reward
+            does not count objects.
+    """
+
+    out_keys = ["advantage", "category_advantage", "valid"]  # noqa: RUF012
+
+    def __init__(self, *, credit: str = "auto", category_credit: str = "auto") -> None:
+        super().__init__(credit=credit, clip=math.inf)
+        self.category_credit = category_credit
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``out_keys``."""
+        final = super().forward(tensordict)[:, -1]
+        per_object = self.credited(final)[0].ndim == 2
+        poses_alone = per_object and not bool(final.get("counts_objects", torch.zeros(1)).any())
+        if self.category_credit == "none" or (self.category_credit == "auto" and poses_alone):
+            categories = torch.zeros_like(final["advantage"][:, 0])
+        else:
+            categories = compute_advantages(*final_reward(final), clip=math.inf, groups=prompt_groups(final))
+        return tensordict.set("category_advantage", at_all_steps(categories, tensordict))
+
+    def credited(self, final: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Rewards of slots that are judged, or of scenes."""
+        reward, valid = super().credited(final)
+        judged = final.get("judged", None)
+        return reward, valid if reward.ndim == 1 or judged is None else valid & judged
+
+
+class ForwardProcess(OwnSampleAlgorithm):
+    """Algorithm of NFT and AWM, which differ in their loss; see :class:`ForwardProcessLoss`.
+
+    A slower copy of the prior in training, an average of its weights, samples the scenes. This copy is also evaluated
+    and saved.
+
+    Args:
+        settings: settings of the algorithm.
+        policy: policy that is optimised.
+        stds: sigmas of the reverse steps; not used.
+    """
+
+    loss: ForwardProcessLoss
+
+    def __init__(self, settings: NFTSettings | AWMSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
+        super().__init__(policy, draws=settings.draws, sampler_decay=settings.sampler_decay)
+        self.settings = settings
+        self.advantage = ForwardAdvantage(credit=settings.credit, category_credit=settings.category_credit)
+        rate = settings.expectation_lr
+        self.copy = Expectation(self.sampler, rate) if rate else None
+        self.loss = self.make_loss()
+
+    def make_loss(self) -> ForwardProcessLoss:
+        """The loss that the settings name."""
+        settings = self.settings
+        kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
+        return kind(self.prior, self.sampler, beta=settings.beta, clip=settings.advantage_clip, expectation=self.copy)
+
+    def measure(self, result: TensorDict) -> dict[str, float]:
+        """Mean square of the trained denoiser's output minus the sampling policy's."""
+        return {"distance": float(result["distance"]) ** 2}
+
+    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
+        """See :class:`OwnSampleAlgorithm`; ``distance`` is a root mean square."""
+        gradient = super().accumulate(batch, generator)
+        return replace(gradient, columns={**gradient.columns, "distance": gradient.columns["distance"] ** 0.5})
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Sample with the weights of ``prior``; the expectation begins with them as well."""
+        super().return_to(prior)
+        if self.copy is not None:
+            self.copy.return_to(prior)
+
+    def state(self) -> dict[str, Any]:
+        """The state of the sampling policy, and that of the expectation."""
+        return {**super().state(), "expectation": None if self.copy is None else self.copy.state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        super().restore(state)
+        if self.copy is not None:
+            self.copy.restore(state["expectation"])

@@ -1,0 +1,216 @@
+"""Guidance distillation: training of a prior to place objects as physics guidance does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Generator, Tensor
+
+from agents.post_training.algorithms.base import AveragedSampler, BatchGradient, GradientSum, PlainLoss
+from agents.post_training.policy import DenoisingPolicy
+from agents.post_training.rollouts import text_of
+from agents.post_training.settings import GuidanceDistillationSettings
+from agents.priors.guidance import PhysicsGuidance, position_std
+from agents.priors.prior import NoisedScenes, ScenePrior
+from agents.utils.process_group import ProcessGroup
+from scene_envs.errors import InvalidInputError
+from scene_envs.scene import POSE_FEATURES, TRANSLATION
+
+_MIN_STD = 1e-4
+"""Smallest standard deviation of a denoised feature in the loss, normalised."""
+_MIN_METRES = 1e-6
+"""Smallest standard deviation of a denoised position, m, with which moves are compared."""
+
+
+class GuidanceDistillationLoss(PlainLoss):
+    """Squared difference of denoised poses from a teacher's, divided by the variance of the denoiser's error.
+
+    For one reverse step, the loss of an entry is an upper bound of twice the KL divergence of the prior's step from the
+    teacher's: both are normal with the same variance, which includes the error of the denoised entry.
+
+    Accepted keys (``set_keys``):
+        scene: (B, N, D) float, scenes x_t of a chain. Default ``"scene"``.
+        timestep: (B,) or (B, 1) int64, timesteps of these scenes. Default ``"timestep"``.
+        denoised: (B, N, 12) float, the teacher's estimate of the normalised poses of x_0. Default ``"denoised"``.
+        trained: (B, N) bool, optional, slots whose poses are trained; without it, all. Default ``"trained"``.
+        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
+
+    Args:
+        prior: prior that is trained.
+
+    Returns (``forward``): ``loss_objective`` (), a mean over the trained entries of a scene, then over the scenes.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="mixed")
+    >>> x, table = prior.initial(2, 34), prior.step_table(4)
+    >>> same = prior.transition(x, 0, table).denoised[..., :12]
+    >>> states = {"scene": x, "timestep": table.timesteps[:1].expand(2), "denoised": same}
+    >>> bool(GuidanceDistillationLoss(prior)(TensorDict(states, [2]))["loss_objective"] < 1e-6)
+    True
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        scene: NestedKey = "scene"
+        timestep: NestedKey = "timestep"
+        denoised: NestedKey = "denoised"
+        trained: NestedKey = "trained"
+        text: NestedKey = "text"
+        text_mask: NestedKey = "text_mask"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_objective"]  # noqa: RUF012  (torchrl reads lists)
+    prior: ScenePrior
+
+    def __init__(self, prior: ScenePrior) -> None:
+        super().__init__()
+        self.prior = prior
+
+    @property
+    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
+        """Keys that must be present."""
+        return [self.tensor_keys.scene, self.tensor_keys.timestep, self.tensor_keys.denoised]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss of a batch of scenes of a chain."""
+        keys, flat = self.tensor_keys, tensordict.reshape(-1)
+        x, t = flat.get(keys.scene).detach(), flat.get(keys.timestep).reshape(-1)
+        teacher, trained = flat.get(keys.denoised).detach(), flat.get(keys.trained, None)
+        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
+        text = None if tokens is None or mask is None else (tokens.detach(), mask)
+        weight = self.prior.loss_weight(x.shape[1]).to(x)[:, :POSE_FEATURES].expand(len(x), -1, -1)
+        weight = weight if trained is None else weight * trained[..., None]
+        noised = NoisedScenes(
+            x_t=x, t=t, target=teacher, weight=weight, scale=x.new_ones(len(x)),
+            category=x[..., POSE_FEATURES:].argmax(dim=-1),
+            observed=self.prior.observed_entries(x),
+        )  # fmt: skip
+        found = self.prior.denoised(noised, self.prior.output(noised, text))[..., :POSE_FEATURES]
+        entries = ((found - teacher) / self._std(t, x)).square() * weight
+        losses = entries.sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
+        return TensorDict({"loss_objective": losses.mean()}, [])
+
+    def _std(self, t: Tensor, like: Tensor) -> Tensor:
+        """(B, 1, 12) standard deviation of the denoised poses at timesteps (B,)."""
+        levels, rows = t.unique(return_inverse=True)
+        process, residual = self.prior.process, self.prior.residual
+        stds = torch.stack([process.estimate(int(level), int(level) - 1, residual)[1] for level in levels])
+        return stds[:, :POSE_FEATURES].to(like).clamp(min=_MIN_STD)[rows][:, None]
+
+
+class GuidanceDistillation(AveragedSampler):
+    """On-policy distillation of physics guidance.
+
+    The sampling policy, a slower copy of the prior, samples a batch of scenes without physics guidance. At random steps
+    of these chains, :class:`~agents.priors.guidance.PhysicsGuidance` corrects the scenes that the copy
+    denoises, and the prior is trained to denoise the same x_t to the corrected poses. The states come from the policy
+    itself, as in DAgger (Ross et al. 2011), so the prior learns to correct its own errors. The gradient vanishes where
+    the guidance has nothing to correct. Rotations are held at those that the copy denoises, and categories get no
+    gradient. The reward is only reported.
+
+    Args:
+        settings: settings of the algorithm.
+        policy: policy that is optimised.
+        stds: sigmas of the reverse steps; not used.
+
+    Attributes:
+        steps: steps of the chain at which the guidance moves objects.
+
+    Raises:
+        InvalidInputError: the guidance acts at no step of the chain, or the assets have no geometry.
+    """
+
+    loss: GuidanceDistillationLoss
+
+    def __init__(self, settings: GuidanceDistillationSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
+        super().__init__(policy, sampler_decay=settings.sampler_decay, warm_up=0.0)
+        if not self.prior.scene_type.has_geometry:
+            raise InvalidInputError(
+                f"algorithm={settings.name} needs the geometry of the assets, which scene type "
+                f"{self.prior.scene_type.name!r} does not have; take another algorithm, such as nft"
+            )
+        self.settings = settings
+        self.loss = GuidanceDistillationLoss(self.prior)
+        self._teacher = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, independent=False)
+        table: Any = policy.table
+        self._stds = [position_std(self.sampler, step, table) for step in range(len(policy))]
+        self.steps = [step for step, std in enumerate(self._stds) if PhysicsGuidance.acts(std)]
+        if not self.steps:
+            error = 1e3 * float(self._stds[-1][:2].max())
+            raise InvalidInputError(
+                f"algorithm={settings.name} has nothing to learn: physics guidance acts once horizontal positions are "
+                f"known to 3 cm, and the error of this prior is {error:.0f} mm at the last of num_steps={len(policy)} "
+                "steps; pretrain the prior for longer"
+            )
+
+    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
+        """Add the gradient of a batch to ``.grad``: ``draws`` random steps of the chain of every scene.
+
+        With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
+        """
+        processes, own = ProcessGroup.current(), len(batch)
+        count, draws = processes.size * own, self.settings.draws
+        chosen = [
+            torch.tensor(self.steps)[torch.randint(len(self.steps), (count,), generator=generator)]
+            for _ in range(draws)
+        ]
+        states = [self.corrected(batch, steps[processes.rows(count)]) for steps in chosen]
+        size, total = self.policy.chunk or own, 0.0
+        gradient = GradientSum(self.prior.parameters())
+        for start in range(0, own, size):
+            for state in states:
+                part = state[start : start + size]
+                objective = self.loss(part)["loss_objective"] * (len(part) / count / draws)
+                objective.backward()
+                total += float(objective.detach())
+            gradient.add_part()
+        gradient.write()
+        moved, objects = (float(sum(state[name].sum() for state in states)) for name in ("moved", "trained"))
+        total, moved, objects = processes.sum_numbers(total, moved, objects)
+        return BatchGradient(total, {"correction_mm": 1e3 * moved / max(1.0, objects)})
+
+    @torch.no_grad()
+    def corrected(self, batch: TensorDictBase, steps: Tensor) -> TensorDict:
+        """The states (B,) of scenes at ``steps`` (B,) of their chains, all in :attr:`steps`, as the loss reads them.
+
+        ``moved`` (B, N) is how far the guidance moves each object, m.
+        """
+        rows = [torch.nonzero(steps == step)[:, 0] for step in self.steps]
+        parts = [
+            self._corrected_at(batch[at.to(batch.device), step], step)
+            for step, at in zip(self.steps, rows, strict=True)
+            if len(at)
+        ]
+        return torch.cat(parts)[torch.cat(rows).argsort()]
+
+    def _corrected_at(self, states: TensorDictBase, step: int) -> TensorDict:
+        """The states [R] of a chain at one step, as the loss reads them."""
+        x, text = states["scene"], text_of(states)
+        denoised = self._teacher.distribution(x, step, text).denoised
+        assert denoised is not None
+        movable = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
+        movable[:, : len(self.sampler.scene_type.fixed)] = False
+        scenes = self.sampler.decode(denoised)
+        guidance, std = PhysicsGuidance(self.settings.strength, movable), self._stds[step]
+        moves = guidance(step, len(self.policy), lambda: scenes, std)
+        assert moves is not None
+        moves = moves.to(x) * movable[..., None]
+        far = (moves / std.to(x).clamp(min=_MIN_METRES)).norm(dim=-1, keepdim=True)
+        target = denoised[..., :POSE_FEATURES].clone()
+        scale = self.sampler.normalizer.scale[TRANSLATION].to(x)
+        target[..., TRANSLATION] += scale * moves * (self.settings.clip / far.clamp(min=self.settings.clip))
+        fields: dict[str, Any] = {
+            "scene": x,
+            "timestep": states["timestep"],
+            "denoised": target,
+            "trained": movable & ~scenes.is_empty.to(x.device),
+            "moved": moves.norm(dim=-1),
+        }
+        if text is not None:
+            fields["text"], fields["text_mask"] = text
+        return TensorDict(fields, [len(x)])

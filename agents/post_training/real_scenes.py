@@ -1,0 +1,209 @@
+"""Real scenes for the regularisation and for the guard: from a dataset, or from the grammar."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from agents.post_training.rollouts import PROMPTS_NAME, PromptSets, save_prompts, stream_seed
+from agents.post_training.run_files import BASE_SAMPLES_NAME, SCENES_NAME, writing
+from agents.post_training.settings import PostTrainConfig, RegularisationSettings
+from agents.priors.prior import ScenePrior, asked_objects
+from agents.utils.process_group import ProcessGroup
+from scene_envs.errors import InvalidInputError
+from scene_envs.progress import Progress
+from scene_envs.scene import SceneBatch
+from scene_envs.scene_types import SceneType
+
+_WITHHELD = 0.1
+"""Share of real scenes whose prompt is withheld, as in pretraining."""
+_DRAWN = 64
+"""Number of scenes of the grammar between two updates of the progress."""
+
+
+@dataclass(frozen=True)
+class PromptedScenes:
+    """Normalised scenes and one prompt for each.
+
+    Attributes:
+        scenes: (M, N, D) normalised scenes.
+        prompts: one prompt per scene, ``""`` for a scene without one; None for a prior that reads no prompts.
+    """
+
+    scenes: Tensor
+    prompts: Sequence[str] | None
+
+    def batch(self, count: int, generator: Generator) -> PromptedScenes:
+        """``count`` scenes and their prompts, drawn with replacement."""
+        index = torch.randint(len(self.scenes), (count,), generator=generator)
+        prompts = None if self.prompts is None else [self.prompts[i] for i in index.tolist()]
+        return PromptedScenes(self.scenes[index], prompts)
+
+
+@dataclass(frozen=True)
+class SceneBank:
+    """Normalised real scenes, in a fixed split into training scenes and held-out scenes.
+
+    Attributes:
+        train: (M, N, D) scenes for the regularisation.
+        heldout: (K, N, D) scenes for the guard.
+        prompts: all prompts of a scene by its index, with held-out scenes after training scenes; None without prompts.
+        base: samples of the base prior; None for none.
+    """
+
+    train: Tensor
+    heldout: Tensor
+    prompts: PromptSets | None = None
+    base: PromptedScenes | None = None
+
+    @classmethod
+    def split(cls, x0: Tensor, heldout: int, prompts: PromptSets | None = None) -> SceneBank:
+        """A bank of ``x0`` (M, N, D), of which the last ``heldout`` scenes are held out."""
+        if not 0 < heldout < len(x0):
+            raise InvalidInputError(f"{len(x0)} real scenes cannot spare {heldout} for the guard; give more scenes")
+        return cls(x0[:-heldout], x0[-heldout:], prompts)
+
+    def batch(self, count: int, generator: Generator) -> PromptedScenes:
+        """``count`` training scenes, drawn with replacement, each with one of its prompts.
+
+        As in pretraining, the prompt is withheld (``""``) from one scene in ten.
+        """
+        index = torch.randint(len(self.train), (count,), generator=generator)
+        texts = None
+        if self.prompts is not None:
+            choice, withheld = torch.rand(2, count, generator=generator).tolist()
+            texts = [
+                "" if drop < _WITHHELD else (group := self.prompts(i))[int(pick * len(group))]
+                for i, pick, drop in zip(index.tolist(), choice, withheld, strict=True)
+            ]
+        return PromptedScenes(self.train[index], texts)
+
+    def heldout_prompts(
+        self, count: int | None = None, slots: int | None = None, scene_type: SceneType | None = None
+    ) -> list[str] | None:
+        """One prompt of each held-out scene; kinds of prompts alternate from scene to scene; None without prompts.
+
+        Args:
+            count: number of scenes; None for all.
+            slots: largest number of objects that a prompt may ask for; ``""`` stands for a prompt that asks for more.
+                None allows any number.
+            scene_type: scene type of the scenes; only needed with ``slots``.
+        """
+        if self.prompts is None:
+            return None
+        first, count = len(self.train), len(self.heldout) if count is None else count
+        texts = [(group := self.prompts(first + i))[i % len(group)] for i in range(count)]
+        if slots is None or scene_type is None:
+            return texts
+        return [text if asked_objects(text, scene_type) <= slots else "" for text in texts]
+
+
+def kept_scenes(
+    directory: Path,
+    prior: ScenePrior,
+    settings: RegularisationSettings,
+    seed: int,
+    slots: int,
+    *,
+    reuse: bool,
+    progress: str = "none",
+) -> SceneBatch:
+    """The real scenes of a run, kept in its folder with the prompts of a dataset; the first process draws them.
+
+    Args:
+        directory: folder of the run.
+        prior, seed, slots: the arguments of :func:`real_scenes`.
+        settings: source and number of the scenes.
+        reuse: load the scenes that are already in the folder, as a resumed run does.
+        progress: a style of :class:`~scene_envs.progress.Progress`.
+    """
+    path, texts, processes = directory / SCENES_NAME, directory / PROMPTS_NAME, ProcessGroup.current()
+    if processes.is_first and not (reuse and path.exists()):
+        count = settings.bank_size
+        batch, found = real_scenes(prior, settings.scenes, count, seed=seed, slots=slots, progress=progress)
+        writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
+        texts.unlink(missing_ok=True)  # prompts of other scenes, left by a run without a checkpoint
+        if found is not None and prior.conditional:
+            writing(f"their prompts {str(texts)!r}", lambda: save_prompts(texts, found))
+    processes.wait()
+    return SceneBatch.load(path)
+
+
+def real_scenes(
+    prior: ScenePrior, source: str, count: int, *, seed: int, slots: int | None = None, progress: str = "none"
+) -> tuple[SceneBatch, list[tuple[str, ...]] | None]:
+    """``count`` real scenes of the prior's scene type, and the prompts of each if they have any.
+
+    Args:
+        prior: prior of the wanted scene type.
+        source: ``"grammar"``, or the directory of a dataset.
+        count: number of scenes; a smaller dataset gives all it has.
+        seed: seed of the grammar, or of the choice of rows.
+        slots: smallest number of slots per scene; None takes as many as the prior was trained on. Real scenes keep all
+            their slots, because a prior reads any number of slots.
+        progress: a style of :class:`~scene_envs.progress.Progress`.
+    """
+    slots = max(prior.scene_type.slots, prior.config.slots if slots is None else slots)
+    if source == "grammar":
+        from scene_envs.grammars import get_grammar
+
+        rng, grammar, parts, title = np.random.default_rng(seed), get_grammar(prior.scene_type), [], "real scenes"
+        with Progress(title, count, style=progress) as shown:
+            for first in range(0, count, _DRAWN):
+                parts.append(grammar.sample(rng, min(_DRAWN, count - first)))
+                done = first + len(parts[-1])
+                shown.update(done, "", f"{title} {done}/{count}")
+        return SceneBatch.concatenate(parts).with_slots(slots), None
+    from scene_envs.datasets import SceneDataset
+
+    if not Path(source).is_dir():
+        raise InvalidInputError(f"real_scenes={source!r} is neither 'grammar' nor the directory of a dataset")
+    dataset = SceneDataset.load(source)
+    rows = torch.randperm(len(dataset.tensor), generator=Generator().manual_seed(seed))[:count]
+    batch = SceneBatch(dataset.tensor[rows], prior.scene_type)
+    return batch.with_slots(max(slots, batch.tensor.shape[1])), [dataset.prompt_sets[i] for i in rows.tolist()]
+
+
+def kept_base_samples(
+    directory: Path,
+    base: ScenePrior,
+    bank: SceneBank,
+    config: PostTrainConfig,
+    *,
+    reuse: bool,
+    progress: str = "none",
+) -> PromptedScenes:
+    """The base prior's samples of a run, kept in its folder; the first process draws them.
+
+    The samples have the prompts of real scenes, so that prompts do not distinguish samples from real scenes.
+
+    Args:
+        directory: folder of the run.
+        base: the base prior.
+        bank: real scenes, which give the prompts and the number of slots.
+        config: configuration of the run.
+        reuse: load the samples that are already in the folder, as a resumed run does.
+        progress: a style of :class:`~scene_envs.progress.Progress`.
+    """
+    path, processes, count = directory / BASE_SAMPLES_NAME, ProcessGroup.current(), config.regularisation.base_samples
+    prompts = bank.batch(count, Generator().manual_seed(stream_seed(config.seed, "base_prompts"))).prompts
+    if processes.is_first and not (reuse and path.exists()):
+        with Progress("base samples", count, style=progress, always=(0,)) as shown:
+            shown.update(0, "", f"drawing {count} samples of the base prior")
+            batch = base.sample(
+                count,
+                prompt=prompts,
+                physics_guidance=0.0,
+                num_steps=config.num_steps,
+                slots=bank.train.shape[1],
+                seed=stream_seed(config.seed, "base_samples"),
+                batch_size=config.batch_size,
+            )
+        writing(f"the base prior's samples {str(path)!r}", lambda: batch.save(path))
+    processes.wait()
+    return PromptedScenes(base.encode(SceneBatch.load(path).to(base.device)), prompts)

@@ -1,0 +1,701 @@
+"""Configuration of one post-training run; imports no torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+from agents.configuration.composition import (
+    LoggerSettings,
+    OptimizerSettings,
+    ProgressKeys,
+    RewardLimits,
+    SamplingKeys,
+    TrainingKeys,
+    composed,
+    named,
+    nested,
+    plain_tree,
+    require_at_least,
+    require_one_of,
+    require_positive,
+)
+from agents.utils.loggers import LOGGERS
+from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
+from scene_envs.errors import InvalidInputError
+from scene_envs.registry import Registry
+
+CREDITS = ("auto", "scene", "object")
+CATEGORY_CREDITS = ("auto", "scene", "none")
+
+
+@dataclass
+class AlgorithmSettings:
+    """Settings that all algorithms share.
+
+    Attributes:
+        name: name of a registered algorithm.
+        scenes_per_prompt: number of scenes of a batch that share a prompt; advantages are computed within such a group.
+    """
+
+    learning_rate: ClassVar[float] = 5e-5
+    """Learning rate unless ``optimizer.lr`` names another."""
+    regularisation_weight: ClassVar[float] = 0.5
+    """Coefficient of the pretraining loss unless ``regularisation.weight`` names another."""
+    sample_limits: ClassVar[Mapping[str, float]] = {}
+    """Limits of the guard's sample figures unless ``guard`` names others; a reward may ask for other object counts."""
+
+    name: str = ""
+    scenes_per_prompt: int = 8
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 2, "scenes_per_prompt")
+
+    @property
+    def optimiser_steps(self) -> int:
+        """Optimiser steps per batch: the key ``updates`` of algorithms that have it."""
+        return getattr(self, "updates", 1)
+
+
+@dataclass
+class DDPOSFSettings(AlgorithmSettings):
+    """DDPO-SF: the score-function policy gradient (Black et al. 2024, Eq. 3).
+
+    Attributes:
+        gradient_steps: number of denoising steps per iteration that contribute to the gradient, drawn from the eligible
+            steps.
+        min_std: smallest sigma of an eligible step, in normalised units; steps with less noise are excluded from the
+            gradient.
+        credit: ``scene`` gives every slot the advantage of the scene, ``object`` gives it its own (for rewards with
+            ``per_object``), ``auto`` uses ``object`` if the reward allows it.
+    """
+
+    name: str = "ddpo_sf"
+    gradient_steps: int = 8
+    min_std: float = 0.03
+    credit: str = "auto"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_at_least(self, 1, "gradient_steps")
+        require_positive(self, "min_std")
+        require_one_of(self, "credit", CREDITS)
+
+
+@dataclass
+class DDPOISSettings(DDPOSFSettings):
+    """DDPO-IS: DDPO with clipped importance weights, for several updates per batch (Eq. 4).
+
+    Attributes:
+        clip_epsilon: half-width of the clip of the probability ratio.
+        updates: optimiser steps per batch.
+    """
+
+    name: str = "ddpo_is"
+    clip_epsilon: float = 1e-4
+    updates: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_at_least(self, 1, "updates")
+        if not 0 < self.clip_epsilon < 1:
+            raise InvalidInputError(f"clip_epsilon={self.clip_epsilon} must lie between 0 and 1")
+
+
+@dataclass
+class ForwardProcessSettings(AlgorithmSettings):
+    """Settings that the forward-process algorithms share.
+
+    Attributes:
+        updates: optimiser steps per batch.
+        draws: number of timesteps and noises of every scene per optimiser step.
+        credit: credit of poses: ``scene`` gives every slot the advantage of the scene, ``object`` gives it its own (for
+            rewards with ``per_object``), ``auto`` uses ``object`` if the reward allows it.
+        category_credit: credit of categories: ``scene`` uses the advantage of the scene, ``none`` keeps the categories
+            as they are, ``auto`` is ``none`` if poses have credit per object and the reward counts no objects, else
+            ``scene``.
+        sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
+    """
+
+    learning_rate: ClassVar[float] = 2e-4
+    regularisation_weight: ClassVar[float] = 0.2
+    sample_limits: ClassVar[Mapping[str, float]] = {
+        "count_distance": 1.0,
+        "stack_distance": 0.5,
+        "category_kl": 0.05,
+        "classifier_accuracy": 0.1,
+    }
+
+    updates: int = 2
+    draws: int = 2
+    credit: str = "auto"
+    category_credit: str = "auto"
+    sampler_decay: float = 0.9
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_at_least(self, 1, "updates", "draws")
+        require_one_of(self, "credit", CREDITS)
+        require_one_of(self, "category_credit", CATEGORY_CREDITS)
+        if not 0 <= self.sampler_decay < 1:
+            raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
+
+
+@dataclass
+class NFTSettings(ForwardProcessSettings):
+    """NFT: good samples pull, bad samples push, both within bounds (Zheng et al. 2025).
+
+    Attributes:
+        beta: strength; smaller ones step further from the sampling policy.
+        advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
+        expectation_lr: learning rate of the copy of the denoiser that learns the mean of own samples; 0 takes the
+            sampling policy for it.
+    """
+
+    name: str = "nft"
+    beta: float = 0.5
+    advantage_clip: float = 2.0
+    expectation_lr: float = 3e-4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive(self, "beta", "advantage_clip")
+        require_at_least(self, 0, "expectation_lr")
+
+
+@dataclass
+class AWMSettings(ForwardProcessSettings):
+    """AWM: the pretraining loss of own samples times their advantage (Xue et al. 2025).
+
+    Attributes:
+        beta: strength of the pull to the sampling policy, above 1.
+        advantage_clip: largest advantage, in standard deviations.
+        expectation_lr: the setting of the same name of ``nft``.
+    """
+
+    name: str = "awm"
+    beta: float = 2.0
+    advantage_clip: float = 2.0
+    expectation_lr: float = 3e-4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive(self, "advantage_clip")
+        require_at_least(self, 0, "expectation_lr")
+        if not self.beta > 1:
+            raise InvalidInputError(f"beta={self.beta} must be above 1: below, a bad sample pushes without bound")
+
+
+@dataclass
+class GuidanceDistillationSettings(AlgorithmSettings):
+    """Guidance distillation: the prior learns to place objects as physics guidance does; the reward is reported only.
+
+    Attributes:
+        updates: optimiser steps per batch.
+        draws: number of steps of the chain of every scene per optimiser step.
+        strength: strength of the physics guidance that is learned, 0 to 1.
+        clip: largest move of an object that is learned at a step, in standard deviations of its denoised position.
+        sampler_decay: decay of the averaged weights that sample, per iteration.
+    """
+
+    learning_rate: ClassVar[float] = 2e-4
+    regularisation_weight: ClassVar[float] = 0.03
+    sample_limits: ClassVar[Mapping[str, float]] = ForwardProcessSettings.sample_limits
+
+    name: str = "guidance_distillation"
+    updates: int = 4
+    draws: int = 2
+    strength: float = 1.0
+    clip: float = 1.0
+    sampler_decay: float = 0.9
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_at_least(self, 1, "updates", "draws")
+        require_positive(self, "strength", "clip")
+        if self.strength > 1:
+            raise InvalidInputError(f"strength={self.strength:g} must lie in (0, 1]; 1 learns the whole moves")
+        if not 0 <= self.sampler_decay < 1:
+            raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
+
+
+ENTRY_POINT_GROUP = "scene_envs.algorithms"
+"""Entry points of installed packages: modules that call :func:`register_algorithm` when they are imported."""
+
+Algorithm = TypeVar("Algorithm", bound=type)
+
+
+@dataclass(frozen=True)
+class _Entry:
+    settings: type[AlgorithmSettings]
+    code: Any
+    """The class, or its ``module:class``, which is imported when it is needed."""
+
+
+_FORWARD = "agents.post_training.algorithms.forward_process:ForwardProcess"
+_ALGORITHMS = Registry(
+    "algorithm",
+    ENTRY_POINT_GROUP,
+    {
+        "ddpo_sf": _Entry(DDPOSFSettings, "agents.post_training.algorithms.ddpo:DDPO"),
+        "ddpo_is": _Entry(DDPOISSettings, "agents.post_training.algorithms.ddpo:DDPO"),
+        "guidance_distillation": _Entry(
+            GuidanceDistillationSettings, "agents.post_training.algorithms.guidance_distillation:GuidanceDistillation"
+        ),
+        "nft": _Entry(NFTSettings, _FORWARD),
+        "awm": _Entry(AWMSettings, _FORWARD),
+    },
+)
+
+
+def register_algorithm(
+    name: str, settings: type[AlgorithmSettings] = DDPOSFSettings
+) -> Callable[[Algorithm], Algorithm]:
+    """Make an algorithm available as ``algorithm=name``; the same name again replaces it.
+
+    The decorated class takes ``(settings, policy, stds)`` and extends :class:`~agents.post_training.algorithms.base.Algorithm` or one
+    of its subclasses, such as :class:`agents.post_training.DDPO`.
+
+    Args:
+        name: name of letters, digits and underscores.
+        settings: dataclass of the algorithm's keys, with a sentence for each under ``Attributes:``.
+
+    Raises:
+        InvalidInputError: the name is not one word.
+    """
+    _ALGORITHMS.check_name(name, "my_ddpo")
+    return _ALGORITHMS.adding(name, lambda algorithm: _Entry(settings, algorithm))
+
+
+def list_algorithms() -> list[str]:
+    """Names of all algorithms, those of installed packages included, sorted."""
+    return _ALGORITHMS.names()
+
+
+def algorithm_settings(name: str) -> type[AlgorithmSettings]:
+    """The dataclass of an algorithm's keys.
+
+    Raises:
+        UnknownNameError: no algorithm has that name; the nearest known one is offered.
+    """
+    return _ALGORITHMS[name].settings
+
+
+def make_algorithm(settings: AlgorithmSettings, policy: Any, stds: Any) -> Any:
+    """The algorithm of these settings for a policy, whose steps have the standard deviations ``stds`` (S,)."""
+    code = _ALGORITHMS[settings.name].code
+    if isinstance(code, str):
+        module, _, attribute = code.partition(":")
+        code = getattr(import_module(module), attribute)
+    return code(settings, policy, stds)
+
+
+LOWEST, HIGHEST = 0.01, 100.0
+"""Bounds of the factor."""
+GAIN = 0.05
+"""Change of the factor's logarithm per iteration if the figure's excess over its base value is twice the target's."""
+LOOK_AHEAD = 30.0
+"""Iterations by which a measurement is extrapolated, because the weights act with a delay."""
+SMOOTHING = 10.0
+"""Iterations over which the figure's change per iteration is averaged."""
+LARGEST_ERROR = 3.0
+FAR = 0.5
+"""A target counts as not held at the end if the error of the last measurement is larger than this."""
+PATIENCE = 3
+"""Measurements in a row above the target, with the factor at its upper bound, after which the target is not held."""
+
+
+def held_ratio(text: str) -> float:
+    """Ratio of the held-out loss to the base prior's that a text ``guard:RATIO`` names.
+
+    Raises:
+        InvalidInputError: the text has another form, or the ratio is not above 1.
+
+    >>> held_ratio("guard:1.05")
+    1.05
+    """
+    figure, _, number = text.partition(":")
+    try:
+        ratio = float(number) if figure == "guard" else math.nan
+    except ValueError:
+        ratio = math.nan
+    if not 1 < ratio < math.inf:
+        raise InvalidInputError(
+            f"hold={text!r} must be guard:RATIO, a finite ratio of held-out losses above 1, the base prior's, such as "
+            "guard:1.05"
+        )
+    return ratio
+
+
+def relative_error(target: float, measured: float) -> float:
+    """Measured ratio minus target, divided by target minus 1: 0 at the target, -1 at the base prior's ratio."""
+    error = (measured - 1.0) / (target - 1.0) - 1.0
+    return max(-1.0, min(error, LARGEST_ERROR)) if error == error else LARGEST_ERROR
+
+
+@dataclass(frozen=True)
+class HoldState:
+    """State of the controller; plain numbers, for checkpoints.
+
+    Attributes:
+        log_factor: logarithm of the factor on the weight of the regularisation.
+        iteration: of the last measurement.
+        measured: the last value; None before the first.
+        slope: its change per iteration, averaged.
+        beyond: measurements in a row that were above the target while the factor was at its upper bound.
+        lost_at: iteration from which the target counts as not held; None while it counts as held.
+    """
+
+    log_factor: float = 0.0
+    iteration: int = 0
+    measured: float | None = None
+    slope: float = 0.0
+    beyond: int = 0
+    lost_at: int | None = None
+
+    @property
+    def factor(self) -> float:
+        """Factor on the weight."""
+        return math.exp(self.log_factor)
+
+    def returned(self, measured: float) -> HoldState:
+        """The state after a return to an earlier checkpoint of ratio ``measured``, which is no change by training."""
+        return replace(self, measured=measured, slope=0.0)
+
+
+def adjust(state: HoldState, target: float, measured: float, iteration: int) -> HoldState:
+    """The state after a measurement: integral control of the factor's logarithm, within bounds.
+
+    It is the controller of Ziegler et al. (2019, Eq. 4) with two changes. The gain is per iteration, so that checks
+    may come at any distance. The figure is extrapolated by ``LOOK_AHEAD`` iterations with its averaged change per
+    iteration. The error is bounded; an error that is not a number counts as the largest.
+
+    Args:
+        state: state before the measurement.
+        target: ratio that is held.
+        measured: ratio of the held-out loss to the base prior's now.
+        iteration: number of the finished iteration.
+
+    >>> state = adjust(HoldState(), 1.05, measured=1.1, iteration=1)
+    >>> round(state.factor, 3)
+    1.162
+    """
+    span = max(1, iteration - state.iteration)
+    first = measured if state.iteration else 1.0
+    before = first if state.measured is None else state.measured
+    slope = state.slope + (1.0 - math.exp(-span / SMOOTHING)) * ((measured - before) / span - state.slope)
+    slope = slope if math.isfinite(slope) else 0.0
+    error = relative_error(target, measured + LOOK_AHEAD * slope)
+    step = GAIN * span * error
+    log_factor = max(math.log(LOWEST), min(state.log_factor + step, math.log(HIGHEST)))
+    beyond = state.beyond + 1 if relative_error(target, measured) > 0 and log_factor >= math.log(HIGHEST) else 0
+    lost_at = iteration if state.lost_at is None and beyond >= PATIENCE else state.lost_at
+    return HoldState(log_factor, iteration, measured, slope, beyond, lost_at)
+
+
+SHARPNESS = 20.0
+"""Scale of the discriminative loss; with a larger value the prior moves less far from its base."""
+OBJECTIVES = ("pretraining", "discriminative")
+"""Losses of the regularisation."""
+
+
+@dataclass
+class RegularisationSettings:
+    """Settings of the regularisation: pretraining loss on real scenes.
+
+    Attributes:
+        objective: ``pretraining`` is the pretraining loss on real scenes. ``discriminative`` raises the likelihood of
+            real scenes relative to the base prior and lowers that of samples of the base prior.
+        weight: coefficient of this loss; null takes the default of the algorithm.
+        base_samples: number of samples of the base prior in the discriminative loss; they are drawn once.
+        hold: target that the run holds by adjusting the coefficient: ``guard:1.05`` is the held-out loss as a ratio to
+            the base prior's; null keeps the coefficient constant.
+        batch_size: real scenes per update.
+        scenes: source of the real scenes: ``grammar``, or a dataset folder.
+        bank_size: number of real scenes that are drawn from the grammar or read from the dataset, including the
+            held-out scenes.
+    """
+
+    objective: str = "pretraining"
+    weight: float | None = None
+    base_samples: int = 1024
+    hold: str | None = None
+    batch_size: int = 48
+    scenes: str = "grammar"
+    bank_size: int = 4096
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "batch_size", "base_samples")
+        require_one_of(self, "objective", OBJECTIVES)
+        if self.weight is not None and not self.weight >= 0:
+            raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
+        if self.target is not None and self.weight == 0:
+            raise InvalidInputError(f"hold={self.hold} adjusts regularisation.weight, which is 0; give a weight")
+
+    @property
+    def target(self) -> float | None:
+        """Ratio of the held-out loss to the base prior's that ``hold`` names."""
+        return None if self.hold is None else held_ratio(self.hold)
+
+    @property
+    def pretraining_weight(self) -> float:
+        """``weight``, or 0 for null; the config of a run has replaced null by the default of the algorithm."""
+        return self.weight or 0.0
+
+
+RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "progress", "reward_timeout", "reward_memory")
+"""Fields that may change between a run and its continuation."""
+
+
+@dataclass
+class PostTrainOptimizerSettings(OptimizerSettings):
+    """The optimiser of a post-training run; its steps are updates.
+
+    Attributes:
+        lr: peak learning rate; null takes the default of the algorithm.
+        chunk: scenes per forward and backward pass; null takes the whole batch at once.
+    """
+
+    lr: float | None = None  # type: ignore[assignment]
+    chunk: int | None = None
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "chunk")
+        if self.lr is not None:
+            super().__post_init__()
+
+
+FEWEST_SAMPLES = 20
+"""Samples that the guard's classifier needs."""
+
+
+@dataclass
+class GuardLimits:
+    """Limits of figures of samples; null takes the default of the algorithm.
+
+    Attributes:
+        count: number of objects by which the Wasserstein-1 distance between object counts of samples and of real scenes
+            may exceed the base prior's.
+        stack: the same for the distance between the heights of the tallest stacks, in objects.
+        category: the same for the KL divergence of the categories, in nats.
+        classifier: the same for the accuracy of a classifier that tells samples from real scenes.
+    """
+
+    count: float | None = None
+    stack: float | None = None
+    category: float | None = None
+    classifier: float | None = None
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 0, "count", "stack", "category", "classifier")
+
+
+@dataclass
+class GuardSettings:
+    """Settings of the guard.
+
+    Attributes:
+        every: iterations between checks.
+        scenes: number of held-out real scenes.
+        limit: largest held-out loss of a checkpoint that may be kept, as a ratio to that of the base prior.
+        action: what happens beyond a limit: ``report`` continues, ``stop`` ends the run, ``rollback`` returns to the
+            weights of the best checkpoint and continues with half the learning rate.
+        samples: number of scenes that a check samples, always from the same noise, for the limits below; at most as
+            many as ``scenes``. With fewer than 20, a check measures the loss alone.
+        samples_every: iterations between checks that sample.
+        limits: limits of the figures of samples.
+    """
+
+    every: int = 5
+    scenes: int = 256
+    limit: float = 1.5
+    action: str = "report"
+    samples: int = 128
+    samples_every: int = 20
+    limits: GuardLimits = nested(GuardLimits)
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "every", "scenes", "samples_every")
+        require_positive(self, "limit")
+        require_one_of(self, "action", ("report", "stop", "rollback"))
+        require_at_least(self, 0, "samples")
+
+    @property
+    def sampled(self) -> int:
+        """Number of scenes that a check samples, at most that of the held-out scenes; 0 below ``FEWEST_SAMPLES``."""
+        count = min(self.samples, self.scenes)
+        return count if count >= FEWEST_SAMPLES else 0
+
+    def sample_limits(self, defaults: Mapping[str, float]) -> dict[str, float]:
+        """Limits of figures of samples by name; ``defaults`` are the algorithm's."""
+        own = {
+            "count_distance": self.limits.count,
+            "stack_distance": self.limits.stack,
+            "category_kl": self.limits.category,
+            "classifier_accuracy": self.limits.classifier,
+        }
+        return {**defaults, **{name: limit for name, limit in own.items() if limit is not None}}
+
+
+@dataclass
+class PostTrainLoggerSettings(LoggerSettings):
+    """Files and report of a post-training run.
+
+    Attributes:
+        report_scenes: number of fresh samples, before and after the run, that report.html measures and shows; 0 for no
+            report.
+    """
+
+    report_scenes: int = 256
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.report_scenes < 0:
+            raise InvalidInputError(f"report_scenes={self.report_scenes} must not be negative; 0 writes no report")
+
+
+@dataclass
+class BatchKeys:
+    """Batches of fresh scenes.
+
+    :class:`PostTrainConfig` describes the keys.
+    """
+
+    iterations: int = 60
+    batch_size: int = 48
+    workers: Any = 0
+
+
+@composed
+@dataclass
+class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, RewardLimits):
+    """One post-training run.
+
+    With DDPO-SF, the gradient that AdamW sees is that of
+
+        - step_scale * sum over gradient steps of mean over scenes of  A * log p(x_{t-1} | x_t)
+        + regularisation.weight * pretraining loss on real scenes
+
+    where ``step_scale = steps with weight > 0 / gradient_steps``. log p is a mean over the random entries of a scene,
+    and the pretraining loss is a mean over scenes and entries. The weight is meaningful only with these reductions.
+
+    Keys that are not listed are those of :class:`~agents.configuration.composition.SamplingKeys`,
+    :class:`~agents.configuration.composition.TrainingKeys` and :class:`~agents.configuration.composition.RewardLimits`.
+
+    Attributes:
+        prior: prior from which the run starts: a shipped name or a path.
+        reward: a registered name, or a mapping with ``name`` and settings. In Python also a function or a reward
+            object; it runs in the calling process, so its crash or hang ends or stops the run.
+        iterations: number of iterations; each samples one batch of scenes.
+        batch_size: scenes sampled per iteration.
+        workers: physics worker processes; 0 computes physics in this process; ``ray`` uses the CPUs of a Ray cluster.
+        recipe: a named set of values for the other keys: ``ours``, ``demo_clutter`` or ``demo_feasible``. Keys that are
+            given as well override it.
+        output: run folder; a run that was interrupted there is resumed; empty for runs/COMMAND-TIME on the command
+            line, runs/post-train in Python.
+        prompt: text that the scenes should match, for priors that read prompts: one text, a list such as '["A scene
+            with two cups.", "A scene with 9 objects."]', ``data`` for the prompts of the real scenes, or ``grammar``
+            for descriptions of grammar scenes; null for no prompt.
+        guidance: weight of classifier-free guidance in the policy, 0 for none; needs a prompt.
+        claim_guidance: strength with which sampled scenes are guided to the numbers and places that their prompts
+            give, 0 for none; 2 is a good choice; needs a prompt, and an algorithm that learns from finished samples.
+        seed: seed of the initial noise, the chain's noise, the choice of steps and the real scenes.
+        algorithm: the post-training algorithm.
+        optimizer: the optimiser of the weights.
+        regularisation: losses that keep the prior near real scenes.
+        guard: checks on held-out real scenes.
+        logger: log files and report.
+    """
+
+    prior: str = "dimsum_table_continuous"
+    reward: Any = named("object_count", "reward")
+    prompt: str | list[str] | None = None  # type: ignore[assignment]
+    num_steps: int = 25
+    algorithm: AlgorithmSettings = nested(
+        DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
+    )
+    optimizer: PostTrainOptimizerSettings = nested(
+        PostTrainOptimizerSettings, folder="optimizer", option="adamw", registered=lambda: OptimizerSettings.KNOWN
+    )
+    regularisation: RegularisationSettings = nested(RegularisationSettings)
+    guard: GuardSettings = nested(GuardSettings)
+    logger: PostTrainLoggerSettings = nested(
+        PostTrainLoggerSettings, folder="logger", option="csv", registered=lambda: LOGGERS
+    )
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "iterations", "num_steps", "slots")
+        require_at_least(self, 0, "seed")
+        require_at_least(self, 2, "batch_size")
+        require_positive(self, "reward_timeout", "reward_memory")
+        if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
+            raise InvalidInputError(
+                f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
+            )
+        self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
+        check_prompt(self.prompt, self.guidance)
+        check_claim_guidance(self.prompt, self.claim_guidance)
+        if self.claim_guidance and isinstance(self.algorithm, DDPOSFSettings):
+            raise InvalidInputError(
+                f"claim_guidance={self.claim_guidance:g} changes how scenes are drawn, and "
+                f"algorithm={self.algorithm.name} learns from the probability of its own draws; take algorithm=nft or "
+                "awm, or leave claim_guidance=0"
+            )
+        if self.optimizer.lr is None:
+            self.optimizer = replace(self.optimizer, lr=self.algorithm.learning_rate)
+        if self.regularisation.weight is None:
+            self.regularisation = replace(self.regularisation, weight=self.algorithm.regularisation_weight)
+        target = self.regularisation.target
+        if target is not None and target > self.guard.limit:
+            raise InvalidInputError(
+                f"hold={self.regularisation.hold} lies beyond guard.limit={self.guard.limit:g}, past which no prior is "
+                f"kept; raise guard.limit, or hold at most guard:{self.guard.limit:g}"
+            )
+        if self.regularisation.bank_size < self.guard.scenes + 1:
+            raise InvalidInputError(
+                f"regularisation.bank_size={self.regularisation.bank_size} must exceed guard.scenes="
+                f"{self.guard.scenes}, which are held out of it"
+            )
+
+    @property
+    def directory(self) -> Path:
+        """The run directory."""
+        return Path(self.output or "runs/post-train")
+
+    def plain(self) -> dict[str, Any]:
+        """The configuration as numbers, strings and lists; a reward given as an object becomes its name."""
+        if _is_plain(self.reward):
+            return plain_tree(self)
+        from rewards import reward_name
+
+        return {**plain_tree(replace(self, reward="")), "reward": reward_name(self.reward)}
+
+
+def check_prompt(prompt: Any, guidance: float) -> None:
+    """Refuse a prompt that is no text, list of texts, source of prompts or None; refuse guidance without a prompt."""
+    texts = [prompt] if isinstance(prompt, str) else prompt
+    good = prompt is None or (
+        isinstance(texts, list | tuple) and texts and all(isinstance(t, str) and t for t in texts)
+    )
+    if not good:
+        raise InvalidInputError(
+            f"prompt={prompt!r} must be a text, a list of texts, one of {', '.join(PROMPT_SOURCES)}, or null"
+        )
+    if not math.isfinite(guidance):
+        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
+    if guidance and prompt is None:
+        raise InvalidInputError(
+            f"guidance={guidance:g} strengthens a prompt, and prompt is null; give prompt=, or leave guidance=0"
+        )
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _is_plain(item) for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, str | int | float | bool)

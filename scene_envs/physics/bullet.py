@@ -1,0 +1,378 @@
+"""Simulation of one scene in PyBullet, with bodies of a pool."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from scene_envs.arrays import Array, Index, Mask
+from scene_envs.errors import PhysicsError
+from scene_envs.physics.parts import (
+    FRICTION,
+    GRAVITY,
+    LevelGeometry,
+    LibraryGeometry,
+    angle_between,
+    apply,
+    inset_hull,
+    matrices,
+    principal_inertia,
+    quaternions,
+    times,
+)
+from scene_envs.physics.placement import Budget, Objects
+from scene_envs.progress import quiet_pybullet
+
+BodyKey = tuple[int, str]
+"""Asset category and level of detail ("fine" or "coarse") of a body."""
+
+SCALE = 20.0
+"""Bullet length units per metre. Bullet grows each convex mesh by 0.001 units and rounds its edges by as much. With one
+unit per metre this would be 1 mm; with this scale it is 0.05 mm. Times and masses are not scaled; gravity and inertia
+are scaled to match."""
+MARGIN = 1e-3 / SCALE
+"""Margin (m) that Bullet adds to each convex mesh. Hulls are shrunk by it, so that they act at their true size."""
+
+_PARKING = 1000.0
+"""Height (Bullet units) of the first parked body; the next ones are above it."""
+_PARKING_STEP = 10.0 * SCALE
+_SPARE_BODIES = 64
+_SPARE_FACTOR = 3
+"""A pool is built again when it has more bodies than this many times the bodies that a scene needs, plus
+``_SPARE_BODIES``: in every step Bullet compares the boxes of all bodies, including parked ones."""
+_ZERO = (0.0, 0.0, 0.0)
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+
+class BodyPool:
+    """Bodies of one asset library in a PyBullet client of their own.
+
+    Two properties keep the motion of a scene independent of the scenes before it. The broadphase is Bullet's simple
+    one: it keeps no tree, and lists pairs in the order of the bodies. And a body that is placed or parked gets a
+    fresh broadphase proxy, which drops its pairs, contacts and warm starts.
+
+    Raises:
+        MissingDependencyError: pybullet is not installed.
+        PhysicsError: PyBullet has no free client slot.
+    """
+
+    def __init__(self, library: LibraryGeometry) -> None:
+        self.bullet = quiet_pybullet(
+            "settling and equilibrium need pybullet, whose wheels exist for Python 3.10 and 3.11; "
+            "install it there with: pip install pybullet"
+        )
+        self.client: int = self.bullet.connect(self.bullet.DIRECT)
+        if self.client < 0:
+            raise PhysicsError("PyBullet has no free client slot; close clients that are no longer used")
+        self._library = library
+        self._bodies: dict[BodyKey, list[int]] = {}
+        self._parking: dict[int, tuple[float, float, float]] = {}
+        self._frames: dict[int, tuple[Array, Array]] = {}  # category -> principal moments, axes
+        self._wavefronts: dict[BodyKey, str] = {}
+
+    def principal(self, category: int) -> tuple[Array, Array]:
+        """Principal moments (3,) kg m^2 and axes (3, 3, columns) of an asset's inertia."""
+        if category not in self._frames:
+            self._frames[category] = principal_inertia(self._library.assets[category].asset.inertia)
+        return self._frames[category]
+
+    def take(self, needed: Mapping[BodyKey, int]) -> dict[BodyKey, list[int]]:
+        """The first ``needed[key]`` parked bodies of each key, independently of earlier calls.
+
+        Raises:
+            PhysicsError: PyBullet refuses a shape or a body.
+        """
+        have = sum(len(bodies) for bodies in self._bodies.values())
+        missing = any(len(self._bodies.get(key, ())) < count for key, count in needed.items())
+        if missing or have > _SPARE_FACTOR * sum(needed.values()) + _SPARE_BODIES:
+            sizes = {key: len(bodies) for key, bodies in self._bodies.items()} if missing else {}
+            spare = {key: count + count // 2 + 1 for key, count in needed.items()}
+            self._build({key: max(sizes.get(key, 0), spare.get(key, 0)) for key in {*sizes, *spare}})
+        return {key: self._bodies[key][:count] for key, count in needed.items()}
+
+    def place(self, body: int, position: Sequence[float], quaternion: Sequence[float]) -> None:
+        """Put a body at a position (Bullet units) and orientation, at rest, with a fresh broadphase proxy."""
+        bullet, client = self.bullet, self.client
+        bullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
+        bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
+        bullet.setCollisionFilterGroupMask(body, -1, 1, 1, physicsClientId=client)
+
+    def wake(
+        self, body: int, category: int, quaternion: Sequence[float], *, fixed: bool, damping: tuple[float, float]
+    ) -> None:
+        """Turn a parked body to its orientation and give it the dynamics of the coming simulation."""
+        bullet, client = self.bullet, self.client
+        bullet.resetBasePositionAndOrientation(body, self._parking[body], quaternion, physicsClientId=client)
+        if self._library.static[category]:
+            return
+        bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
+        bullet.changeDynamics(
+            body,
+            -1,
+            mass=0.0 if fixed else float(self._library.assets[category].asset.mass),
+            localInertiaDiagonal=_ZERO if fixed else self._inertia(category),
+            linearDamping=damping[0],
+            angularDamping=damping[1],
+            activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+            physicsClientId=client,
+        )
+
+    def park(self, body: int, category: int) -> None:
+        """Take a body out of the scene."""
+        self.place(body, self._parking[body], _UPRIGHT)
+        if not self._library.static[category]:
+            self.bullet.changeDynamics(
+                body, -1, activationState=self.bullet.ACTIVATION_STATE_SLEEP, physicsClientId=self.client
+            )
+
+    def clear(self) -> None:
+        """Drop all bodies; the next :meth:`take` builds those that it needs."""
+        self._bodies = {}
+
+    def close(self) -> None:
+        """Disconnect from PyBullet."""
+        if self.client >= 0:
+            self.bullet.disconnect(self.client)
+            self.client = -1
+
+    def _build(self, sizes: Mapping[BodyKey, int]) -> None:
+        bullet, client = self.bullet, self.client
+        self.clear()  # an interrupt below must leave no ids of bodies that are gone
+        bullet.resetSimulation(flags=bullet.RESET_USE_SIMPLE_BROADPHASE, physicsClientId=client)
+        bullet.setPhysicsEngineParameter(
+            numSubSteps=0,
+            contactBreakingThreshold=2e-3 * SCALE,
+            deterministicOverlappingPairs=1,
+            enableFileCaching=0,
+            solverResidualThreshold=0.0,
+            # Overlaps within the limits close in 20 ms. With a larger value, fruit that is pushed out keeps rolling.
+            contactERP=0.1,
+            physicsClientId=client,
+        )
+        # A shared small visual: without one PyBullet would read the collision mesh again for every body.
+        visual = bullet.createVisualShape(bullet.GEOM_BOX, halfExtents=(1e-3, 1e-3, 1e-3), physicsClientId=client)
+        bodies: dict[BodyKey, list[int]] = {}
+        self._parking = {}
+        with tempfile.TemporaryDirectory() as folder:
+            for key in sorted(sizes):  # the same order in every process
+                shape = self._shape(key, Path(folder))
+                bodies[key] = []
+                for _ in range(sizes[key]):
+                    place = (0.0, 0.0, _PARKING + _PARKING_STEP * len(self._parking))
+                    body = self._body(key[0], shape, visual, place)
+                    self._parking[body] = place
+                    bodies[key].append(body)
+        self._bodies = bodies
+
+    def _shape(self, key: BodyKey, folder: Path) -> int:
+        """Collision shape of an asset: a compound of its convex parts, about the centre of mass, from a file."""
+        category, level = key
+        if key not in self._wavefronts:
+            geometry: LevelGeometry = getattr(self._library.assets[category], level)
+            axes, center = self.principal(category)[1], self._library.center_of_mass[category]
+            self._wavefronts[key] = _wavefront(
+                [SCALE * (inset_hull(part, MARGIN) - center) @ axes for part in geometry.parts]
+            )
+        path = folder / f"{category}-{level}.obj"
+        path.write_text(self._wavefronts[key])
+        shape = int(
+            self.bullet.createCollisionShape(self.bullet.GEOM_MESH, fileName=str(path), physicsClientId=self.client)
+        )
+        if shape < 0:
+            name = self._library.assets[category].asset.name
+            raise PhysicsError(f"PyBullet refused the collision shape of asset {name!r} ({level} parts)")
+        return shape
+
+    def _inertia(self, category: int) -> list[float]:
+        return (SCALE**2 * self.principal(category)[0]).tolist()  # type: ignore[no-any-return]
+
+    def _body(self, category: int, shape: int, visual: int, place: tuple[float, float, float]) -> int:
+        static = bool(self._library.static[category])
+        mass = 0.0 if static else float(self._library.assets[category].asset.mass)
+        body = self.bullet.createMultiBody(
+            mass, shape, visual, basePosition=place, useMaximalCoordinates=True, physicsClientId=self.client
+        )
+        if body < 0:
+            raise PhysicsError(f"PyBullet could not create a body for asset category {category}")
+        # Bullet multiplies the friction coefficients of the two bodies.
+        settings: dict[str, Any] = {"lateralFriction": math.sqrt(FRICTION), "restitution": 0.0}
+        if not static:
+            # Mass and inertia are set in one call: setting the inertia alone would reset the mass.
+            settings |= {"mass": mass, "localInertiaDiagonal": self._inertia(category)}
+            settings["activationState"] = self.bullet.ACTIVATION_STATE_SLEEP
+        self.bullet.changeDynamics(body, -1, physicsClientId=self.client, **settings)
+        return int(body)
+
+
+def _wavefront(hulls: list[Array]) -> str:
+    """A Wavefront file with one group per hull (V, 3); Bullet makes a compound of them."""
+    lines: list[str] = []
+    offset = 1
+    for index, vertices in enumerate(hulls):
+        lines.append(f"o hull{index}")
+        lines.extend(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices)
+        lines.extend(f"f {a + offset} {b + offset} {c + offset}" for a, b, c in ConvexHull(vertices).simplices)
+        offset += len(vertices)
+    return "\n".join(lines) + "\n"
+
+
+_LOOK = 12
+"""Number of steps between checks for clusters at rest."""
+_USUAL_ITERATIONS = 35
+"""Solver iterations of a step that costs one unit of work per free object."""
+_STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
+"""An object is at rest when its present speed would take it less far than this (m, rad) in the whole duration."""
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """Settings of the integration of motion."""
+
+    time_step: float = 1.0 / 240.0  # length of a step, s
+    iterations: int = 50  # iterations of the sequential-impulse solver per step
+    linear_damping: float = 0.0  # fraction of velocity lost per second
+    angular_damping: float = 0.0  # fraction of angular velocity lost per second
+    tilt: tuple[float, float] = (0.0, 0.0)  # (x, y) angles by which gravity is tilted toward the x and the y axis, rad
+
+
+class World:
+    """PyBullet for one asset library; the motion of a scene depends on that scene alone, bit for bit.
+
+    The order in which bodies are sorted, placed and parked does not depend on the slot order, and bodies never sleep.
+    Threads take turns. A call that is interrupted leaves no bodies behind.
+
+    Raises:
+        MissingDependencyError: pybullet is not installed.
+    """
+
+    def __init__(self, library: LibraryGeometry) -> None:
+        self._library = library
+        self._pool = BodyPool(library)
+        self._lock = threading.Lock()
+
+    def simulate(
+        self, objects: Objects, fine: Mask, group: Index, duration: float, settings: SolverSettings, budget: Budget
+    ) -> tuple[Array, Array, Array, Mask]:
+        """Move the objects of one scene for ``duration`` seconds under gravity.
+
+        Args:
+            objects: The n objects.
+            fine: (n,) bool; True for objects that collide with their fine parts.
+            group: (n,) number of the cluster of each free object; a cluster leaves the simulation when it is at rest.
+            duration: Simulated time, s.
+            settings: Settings of the integration.
+            budget: Units of simulation; when they are spent, all objects stay at the poses reached.
+
+        Returns:
+            rotation (n, 3, 3) and translation (n, 3) m afterwards, the angle turned (n,) in radians, and the objects
+            (n,) that left before the end: those at rest, or all when the budget was spent. Objects that Bullet lost to
+            a numerical failure come back as NaN.
+        """
+        with self._lock:
+            try:
+                return self._simulate(objects, fine, group, duration, settings, budget)
+            except BaseException:  # an interrupt too: bodies that are not parked would meet those of later scenes
+                self._pool.clear()
+                raise
+
+    def _simulate(
+        self, objects: Objects, fine: Mask, group: Index, duration: float, settings: SolverSettings, budget: Budget
+    ) -> tuple[Array, Array, Array, Mask]:
+        bullet, client = self._pool.bullet, self._pool.client
+        category, fixed, count = objects.category, objects.fixed, len(objects)
+        axes = np.array([self._pool.principal(c)[1] for c in category.tolist()])
+        center = self._library.center_of_mass[category]
+        start_quaternion = quaternions(times(objects.rotation, axes))
+        start_position = SCALE * (objects.translation + apply(objects.rotation, center))
+
+        bodies, order = self._bodies(objects, fine)
+        damping = settings.linear_damping, settings.angular_damping
+        for row in order:
+            turn = start_quaternion[row].tolist()
+            self._pool.wake(int(bodies[row]), int(category[row]), turn, fixed=bool(fixed[row]), damping=damping)
+        # After waking: Bullet sets the gravity of active bodies only.
+        down = SCALE * GRAVITY * np.array([*np.sin(settings.tilt), -np.cos(np.hypot(*settings.tilt))])
+        bullet.setGravity(*down.tolist(), physicsClientId=client)
+        # Bullet refreshes a body's world inertia only when it integrates. Some steps out of contact do that.
+        steps = max(1, round(duration / settings.time_step))
+        for _ in range(2 + steps % 2):
+            bullet.stepSimulation(physicsClientId=client)
+        for row in order:
+            self._pool.place(int(bodies[row]), start_position[row].tolist(), start_quaternion[row].tolist())
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=settings.time_step, numSolverIterations=settings.iterations, physicsClientId=client
+        )
+        end_position, end_quaternion = np.empty((count, 3)), np.empty((count, 4))
+        running = {int(label): np.flatnonzero(group == label) for label in np.unique(group[~fixed])}
+        left = np.zeros(count, dtype=bool)
+        done = 0
+        while done < steps:
+            ahead = min(_LOOK, steps - done)
+            for _ in range(ahead if running else ahead % 2):  # the number of all steps is always even
+                bullet.stepSimulation(physicsClientId=client)
+            done += ahead
+            budget.spend(ahead * sum(map(len, running.values())) * settings.iterations / _USUAL_ITERATIONS)
+            leaving = np.zeros(count, dtype=bool)
+            for label, rows in list(running.items()):
+                if done < steps and (budget.is_spent or self._is_still(bodies[rows], duration)):
+                    leaving[rows] = True
+                    del running[label]
+            self._leave(bodies, category, order[leaving[order]], end_position, end_quaternion)
+            left |= leaving
+        self._leave(bodies, category, order[~left[order]], end_position, end_quaternion)
+
+        end_rotation = matrices(end_quaternion)
+        new_rotation = times(end_rotation, axes.swapaxes(-1, -2))
+        new_translation = end_position / SCALE - apply(new_rotation, center)
+        angle = angle_between(start_quaternion, end_quaternion)
+        if not (np.isfinite(end_position).all() and np.isfinite(end_quaternion).all()):
+            self._pool.clear()
+        return new_rotation, new_translation, angle, left
+
+    def close(self) -> None:
+        """Disconnect from PyBullet."""
+        self._pool.close()
+
+    def _bodies(self, objects: Objects, fine: Mask) -> tuple[Index, Index]:
+        """A body (n,) for each object, and the order (n,) in which to treat them."""
+        x, y, z = objects.translation.T
+        order = np.lexsort((x, y, z, fine, objects.category))
+        keys: list[BodyKey] = [
+            (int(category), "fine" if is_fine else "coarse")
+            for category, is_fine in zip(objects.category, fine, strict=True)
+        ]
+        needed: dict[BodyKey, int] = {}
+        for key in keys:
+            needed[key] = needed.get(key, 0) + 1
+        parked = {key: iter(bodies) for key, bodies in self._pool.take(needed).items()}
+        bodies = np.empty(len(objects), dtype=np.int64)
+        for row in order:
+            bodies[row] = next(parked[keys[row]])
+        return bodies, order
+
+    def _is_still(self, bodies: Index, duration: float) -> bool:
+        """Whether all of these bodies are slower than the limits of rest."""
+        speed, turn = _STILL_WAY * SCALE / duration, _STILL_ANGLE / duration
+        for body in bodies.tolist():
+            linear, angular = self._pool.bullet.getBaseVelocity(body, physicsClientId=self._pool.client)
+            if not all(abs(v) < speed for v in linear) or not all(abs(v) < turn for v in angular):
+                return False
+        return True
+
+    def _leave(self, bodies: Index, category: Index, rows: Index, position: Array, quaternion: Array) -> None:
+        """Write the poses of bodies (Bullet units) into ``position`` and ``quaternion``, and park the bodies."""
+        for row in rows.tolist():
+            body = int(bodies[row])
+            position[row], quaternion[row] = self._pool.bullet.getBasePositionAndOrientation(
+                body, physicsClientId=self._pool.client
+            )
+        for row in rows.tolist():
+            self._pool.park(int(bodies[row]), int(category[row]))

@@ -1,0 +1,421 @@
+"""Statics of upright stacks: objects whose rest is found without simulation.
+
+An upright object rests on the one object under it when the centre of mass of the object and everything it carries lies
+inside both the object's foot and the flat face below. From the lowest object up, gaps are closed and small overlaps
+opened. Objects that meet no other object on this way are at rest; all others are simulated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError
+
+from scene_envs.arrays import Array, Index, Mask
+from scene_envs.physics.collision import NEAR, scene_pairs
+from scene_envs.physics.parts import GRAVITY, AssetGeometry, ContactFace, LibraryGeometry, PartGeometry, Rows, apply
+from scene_envs.physics.placement import Contacts, ObjectPairs, Objects
+
+_FLAT = 3e-4
+"""Tilt (rad) up to which an object counts as upright."""
+_FOOT = 1e-4
+"""Corners this close (m) to the lowest one belong to the foot."""
+_MEETS = 2e-4
+"""A contact belongs to the foot when its height agrees with the foot's height to this (m)."""
+_BALANCE = 5e-3
+"""The centre of mass must lie at least this far (m) inside the foot and the face below."""
+_TOUCHING = 1e-4
+"""Overlap (m) with a neighbouring object that is too small to move an object."""
+_DEEPEST = 2e-3
+"""An object that is sunk deeper than this (m) into its support does not simply rise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rest(Rows):
+    """Objects whose motion has a closed form."""
+
+    still: Mask  # (n,) bool; free objects that need no simulation
+    rise: Array  # (n,) m, upward motion of each of them, negative for downward; 0 elsewhere
+    tilt: Array  # (n,) rad, angle that each of them turns to stand upright
+
+
+@dataclass(frozen=True, eq=False)
+class _Polygons:
+    """Convex polygons in the asset's xy plane, padded with copies of their first corner and edge."""
+
+    height: Array  # (P,) z in the asset frame, m; NaN where there is no polygon
+    corners: Array  # (P, V, 2) m
+    normals: Array  # (P, V, 2) outward
+    offsets: Array  # (P, V) m; inside is ``normals @ x <= offsets``
+
+    @classmethod
+    def of(cls, polygons: list[tuple[float, Array] | None]) -> _Polygons:
+        width = max((len(polygon[1]) for polygon in polygons if polygon is not None), default=3)
+        count = len(polygons)
+        height, offsets = np.full(count, np.nan), np.full((count, width), -1.0)
+        corners, normals = np.zeros((count, width, 2)), np.zeros((count, width, 2))
+        for index, polygon in enumerate(polygons):
+            if polygon is None:
+                continue
+            points = polygon[1]
+            edge = np.roll(points, -1, axis=0) - points
+            normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+            height[index] = polygon[0]
+            for target, values in ((corners, points), (normals, normal), (offsets, (normal * points).sum(axis=1))):
+                target[index] = values[0]
+                target[index, : len(points)] = values
+        return cls(height, corners, normals, offsets)
+
+    def outside(self, rows: Index, points: Array) -> Array:
+        """(Q, K) m, distance of points (Q, K, 2) in the asset frame outside polygons ``rows`` (Q,)."""
+        normals, offsets = self.normals[rows][:, None], self.offsets[rows][:, None]
+        along = normals[..., 0] * points[:, :, None, 0] + normals[..., 1] * points[:, :, None, 1]
+        return (along - offsets).max(axis=2)  # type: ignore[no-any-return]
+
+
+class Statics:
+    """Closed-form test of rest, from precomputed feet and surfaces."""
+
+    def __init__(self, library: LibraryGeometry) -> None:
+        self._library = library
+        self._mass = np.array([float(asset.asset.mass) for asset in library.assets])
+        self._foot = _Polygons.of([_foot(asset) for asset in library.assets])
+        self._solid = np.array([asset.bottom is not None and asset.bottom.hole == 0 for asset in library.assets])
+        self._surface = _Polygons.of([_surface(part) for part in library.parts])
+        for asset in library.assets:
+            if asset.is_hollow:  # the coarse parts have tops where there is nothing to stand on
+                self._surface.offsets[asset.coarse.ids] = -np.inf
+        self._rim = _Polygons.of([_rim(asset) for asset in library.assets])
+        tops, bottoms = [asset.top for asset in library.assets], [asset.bottom for asset in library.assets]
+        self._hole_top = np.array([np.inf if top is None else top.hole for top in tops])
+        self._rim_reach = np.array([0.0 if top is None else top.corners for top in tops])
+        self._rim_center = np.array([(0.0, 0.0) if top is None else top.center for top in tops])
+        self._hole_foot = np.array([np.inf if bottom is None else bottom.hole for bottom in bottoms])
+        self._foot_reach = np.array([0.0 if bottom is None else bottom.corners for bottom in bottoms])
+        self._foot_center = np.array([(0.0, 0.0) if bottom is None else bottom.center for bottom in bottoms])
+
+    def at_rest(self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, duration: float) -> Rest:
+        """Objects of one or more scenes that need no simulation for ``duration`` seconds."""
+        count = len(objects)
+        tilt = np.hypot(objects.rotation[:, 0, 2], objects.rotation[:, 1, 2])
+        upright = (tilt < _FLAT) & (objects.rotation[:, 2, 2] > 0)
+        rows, upper, lower = self._standing(objects, contacts, upright)
+        support = np.full(count, -1, dtype=np.int64)
+        drop = np.zeros(count)
+        order = np.lexsort((contacts.gap[rows], upper))
+        found, leading = np.unique(upper[order], return_index=True)
+        chosen = order[leading]
+        support[found], drop[found] = lower[chosen], contacts.gap[rows][chosen]
+        support[objects.fixed] = -1
+        rise, height = _rises(support, drop, objects.fixed)
+        center = self._loaded_center(objects, support, height)
+        best = np.zeros(count, dtype=bool)
+        held = (lower == support[upper]) & (contacts.gap[rows] < drop[upper] + _TOUCHING)
+        rows, upper, lower = rows[held], upper[held], lower[held]
+        good = self._holds(objects, contacts, rows, upper, lower, center)
+        best[upper[good]] = True
+        still = best & (support >= 0) & ~objects.fixed & upright
+        rise = np.maximum(rise, -0.5 * GRAVITY * duration**2)
+        self._clear(objects, pairs, contacts, support, rise, still)
+        while True:  # an object on a simulated object has to be simulated too
+            lost = still & ~(still | objects.fixed)[np.maximum(support, 0)]
+            if not lost.any():
+                break
+            still &= ~lost
+        return Rest(still, np.where(still, rise, 0.0), np.where(still, tilt, 0.0))
+
+    def _standing(self, objects: Objects, contacts: Contacts, upright: Mask) -> tuple[Index, Index, Index]:
+        """Contacts of a foot with a horizontal face below: rows, upper and lower objects."""
+        vertical = np.flatnonzero(np.abs(contacts.direction[:, 2]) > 0.9999)
+        up = contacts.direction[vertical, 2] > 0
+        first, second = contacts.first[vertical], contacts.second[vertical]
+        upper, lower = np.where(up, second, first), np.where(up, first, second)
+        part = np.where(up, contacts.part_first[vertical], contacts.part_second[vertical])
+        z = objects.translation[:, 2]
+        foot = z[upper] + self._foot.height[objects.category[upper]]
+        with np.errstate(invalid="ignore"):
+            meets = np.abs(foot - z[lower] - self._surface.height[part] - contacts.gap[vertical]) < _MEETS
+        good = meets & upright[upper] & upright[lower] & (contacts.gap[vertical] > -_DEEPEST) & ~objects.fixed[upper]
+        return vertical[good], upper[good], lower[good]
+
+    def _loaded_center(self, objects: Objects, support: Index, height: Index) -> Array:
+        """(n, 2) centre of mass of each object together with everything on it, world frame."""
+        mass = self._mass[objects.category].copy()
+        local = self._library.center_of_mass[objects.category]
+        moment = mass[:, None] * (objects.translation + apply(objects.rotation, local))[:, :2]
+        for level in range(int(height.max(initial=0)), 0, -1):
+            rows = np.flatnonzero((height == level) & (support >= 0))
+            np.add.at(mass, support[rows], mass[rows])
+            np.add.at(moment, support[rows], moment[rows])
+        return moment / np.maximum(mass, 1e-12)[:, None]  # type: ignore[no-any-return]
+
+    def _holds(
+        self, objects: Objects, contacts: Contacts, rows: Index, upper: Index, lower: Index, center: Array
+    ) -> Mask:
+        """Whether each contact alone keeps its upper object from tipping."""
+        good = np.zeros(len(rows), dtype=bool)
+        middle = center[upper][:, None]
+        candidates = self._foot.outside(objects.category[upper], _into(objects, upper, middle))[:, 0] < -_BALANCE
+        local = _into(objects, lower, middle)
+        part = np.where(contacts.second[rows] == upper, contacts.part_first[rows], contacts.part_second[rows])
+        inside = candidates & (self._surface.outside(part, local)[:, 0] < -_BALANCE)
+        q = np.flatnonzero(inside)
+        up = objects.category[upper[q]]
+        corners = _into(objects, lower[q], _out_of(objects, upper[q], self._foot.corners[up]))
+        good[q] = self._solid[up] | (self._surface.outside(part[q], corners).max(axis=1) < 0.0)
+        # The test of the rim gives the same result for all parts of the two objects.
+        _, leading = np.unique(upper, return_index=True)
+        q = leading[candidates[leading]]
+        up, down = objects.category[upper[q]], objects.category[lower[q]]
+        at_rim = np.abs(self._rim.height[down] - self._surface.height[part[q]]) < _MEETS
+        offset = np.linalg.norm(
+            _into(objects, lower[q], _out_of(objects, upper[q], self._foot_center[up][:, None]))[:, 0]
+            - self._rim_center[down],
+            axis=1,
+        )
+        at_rim &= self._rim.outside(down, local[q])[:, 0] < -_BALANCE
+        at_rim &= offset <= self._foot_reach[up] - self._hole_top[down]
+        at_rim &= (self._hole_foot[up] == 0) | (offset <= self._rim_reach[down] - self._hole_foot[up])
+        good[q] |= at_rim
+        return good
+
+    def _clear(
+        self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, support: Index, rise: Array, still: Mask
+    ) -> None:
+        """Remove from ``still``, in place, the objects that meet another object on their way."""
+        while True:
+            moved = np.where(still, rise, 0.0)
+            relative = contacts.direction[:, 2] * (moved[contacts.second] - moved[contacts.first])
+            bad = contacts.gap + relative < -_TOUCHING
+            # Both objects of such a contact leave ``still``. Objects that touch a simulated one are simulated anyway.
+            struck = np.zeros(len(still), dtype=bool)
+            struck[contacts.first[bad]] = True
+            struck[contacts.second[bad]] = True
+            struck &= still
+            if not struck.any():
+                break
+            still &= ~struck
+        falling = still & (rise < -0.5 * NEAR)
+        if falling.any():
+            low, high = pairs.low.copy(), pairs.high
+            low[falling, 2] += rise[falling]
+            first, second = scene_pairs(objects)
+            keep = (falling[first] | falling[second]) & ~(objects.fixed[first] | objects.fixed[second])
+            keep &= (support[first] != second) & (support[second] != first)
+            first, second = first[keep], second[keep]
+            meets = ((low[first] <= high[second] + NEAR) & (low[second] <= high[first] + NEAR)).all(axis=1)
+            still[first[meets & falling[first]]] = False
+            still[second[meets & falling[second]]] = False
+
+
+def _rises(support: Index, drop: Array, fixed: Mask) -> tuple[Array, Index]:
+    """Upward motion (m) of each object until it meets its support, and the number of objects that carry it."""
+    rise, height = np.zeros(len(support)), np.zeros(len(support), dtype=np.int64)
+    carried = np.flatnonzero(support >= 0)
+    under = support[carried]
+    while True:
+        new_height = np.where(fixed[under], 1, height[under] + 1)
+        rise[carried] = rise[under] - drop[carried]
+        if (new_height == height[carried]).all() or new_height.max(initial=0) > len(support):
+            return rise, np.minimum(height, len(support))
+        height[carried] = new_height
+
+
+def _into(objects: Objects, rows: Index, points: Array) -> Array:
+    """World points (Q, K, 2) in the frames of upright objects ``rows`` (Q,)."""
+    relative = points - objects.translation[rows, None, :2]
+    r = objects.rotation[rows, :2, :2][:, None]
+    return r[..., 0, :] * relative[..., 0:1] + r[..., 1, :] * relative[..., 1:2]
+
+
+def _out_of(objects: Objects, rows: Index, points: Array) -> Array:
+    """Points (Q, K, 2) of upright objects ``rows`` (Q,) in the world."""
+    r = objects.rotation[rows, :2, :2][:, None]
+    moved = r[..., :, 0] * points[..., 0:1] + r[..., :, 1] * points[..., 1:2]
+    return moved + objects.translation[rows, None, :2]  # type: ignore[no-any-return]
+
+
+def _outline(points: Array) -> Array | None:
+    """Counter-clockwise convex outline (K, 2), or None when there is no area."""
+    if len(points) < 3:
+        return None
+    try:
+        hull = ConvexHull(points)
+    except QhullError:
+        return None
+    return np.asarray(points[hull.vertices]) if hull.volume > 1e-7 else None
+
+
+def _foot(asset: AssetGeometry) -> tuple[float, Array] | None:
+    """Height and outline of the lowest corners of all fine parts."""
+    vertices = asset.fine.vertices
+    height = float(vertices[:, 2].min())
+    outline = _outline(vertices[vertices[:, 2] < height + _FOOT][:, :2])
+    return None if outline is None else (height, outline)
+
+
+def _surface(part: PartGeometry) -> tuple[float, Array] | None:
+    """Height and outline of a part's flat top."""
+    height = float(part.vertices[:, 2].max())
+    outline = _outline(part.vertices[part.vertices[:, 2] > height - 1e-5][:, :2])
+    return None if outline is None else (height, outline)
+
+
+def _rim(asset: AssetGeometry) -> tuple[float, Array] | None:
+    """Height and outline of the asset's top face, which may be a rim round a hole."""
+    if asset.top is None:
+        return None
+    vertices = asset.fine.vertices
+    outline = _outline(vertices[vertices[:, 2] > asset.top.height - 1e-5][:, :2])
+    return None if outline is None else (asset.top.height, outline)
+
+
+_REACH = 2e-3
+"""Pairs further apart than this (m) do not carry each other."""
+_SAME_DEPTH = 1e-4
+"""Coarse and fine overlap may differ by this much (m) and still act alike."""
+_UPRIGHT = 0.999
+"""Cosine of the tilt up to which faces count as facing each other."""
+_CLEAR = 0.01
+_CLEAR_ABOVE = 0.06
+"""Objects are simulated in one cluster when they are within ``_CLEAR`` (m) of each other sideways and within
+``_CLEAR_ABOVE`` (m) in height."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Faces:
+    """Contact faces per category as arrays; NaN where there is none."""
+
+    height: Array
+    center: Array
+    inner: Array
+    corners: Array
+    hole: Array
+
+    @classmethod
+    def of(cls, faces: list[ContactFace | None]) -> _Faces:
+        def column(name: str) -> Array:
+            return np.array([np.nan if face is None else getattr(face, name) for face in faces])
+
+        center = np.array([(np.nan, np.nan) if face is None else face.center for face in faces])
+        return cls(column("height"), center, column("inner"), column("corners"), column("hole"))
+
+
+class Support:
+    """Test of contacts, from precomputed faces."""
+
+    def __init__(self, library: LibraryGeometry) -> None:
+        self.hollow = np.array([asset.is_hollow for asset in library.assets])
+        self.bottom = _Faces.of([asset.bottom for asset in library.assets])
+        self.top = _Faces.of([asset.top for asset in library.assets])
+
+    def needs_fine(self, objects: Objects, pairs: ObjectPairs) -> Mask:
+        """(n,) objects that must collide with their fine parts."""
+        different = self.differs(objects, pairs)
+        fine = np.zeros(len(objects), dtype=bool)
+        fine[pairs.first[different]] = True
+        fine[pairs.second[different]] = True
+        return fine & self.hollow[objects.category]
+
+    def differs(self, objects: Objects, pairs: ObjectPairs) -> Mask:
+        """(P,) pairs whose coarse parts do not carry each other as the fine ones do.
+
+        Coarse shapes act like fine ones in three kinds of contact. The solid outlines of two facing flat faces meet
+        all the way round; or an object lies on a flat surface that is larger than it; or two upright objects are side
+        by side.
+        """
+        a, b = pairs.first, pairs.second
+        relevant = (pairs.gap < _REACH) & (self.hollow[objects.category[a]] | self.hollow[objects.category[b]])
+        same_depth = (pairs.gap >= -_SAME_DEPTH) | (pairs.depth >= -pairs.gap - _SAME_DEPTH)
+        facing = np.abs(pairs.direction[:, 2]) > _UPRIGHT
+        first_above = pairs.direction[:, 2] < 0
+        upper, lower = np.where(first_above, a, b), np.where(first_above, b, a)
+        alike = facing & (
+            self._meets_all_round(objects, upper, lower, pairs.gap)
+            | self._on_plane(objects, upper, lower, pairs.low, pairs.high)
+        )
+        upright = objects.rotation[:, 2, 2] > _UPRIGHT
+        side_by_side = (np.abs(pairs.direction[:, 2]) < 0.1) & upright[a] & upright[b]
+        return relevant & ~(same_depth & (alike | side_by_side))
+
+    def _meets_all_round(self, objects: Objects, upper: Index, lower: Index, gap: Array) -> Mask:
+        up, down = objects.category[upper], objects.category[lower]
+        upright = (objects.rotation[upper, 2, 2] > _UPRIGHT) & (objects.rotation[lower, 2, 2] > _UPRIGHT)
+        center_up = _face_center(objects, upper, self.bottom)
+        center_down = _face_center(objects, lower, self.top)
+        offset = np.hypot(center_up[:, 0] - center_down[:, 0], center_up[:, 1] - center_down[:, 1])
+        hole_up, hole_down = self.bottom.hole[up], self.top.hole[down]
+        with np.errstate(invalid="ignore"):
+            meets = ((hole_down == 0) | (offset <= self.bottom.corners[up] - hole_down)) & (
+                (hole_up == 0) | (offset <= self.top.corners[down] - hole_up)
+            )
+            at_faces = np.abs(center_up[:, 2] - center_down[:, 2] - gap) < 5e-3
+        return upright & meets & at_faces
+
+    def _on_plane(self, objects: Objects, upper: Index, lower: Index, low: Array, high: Array) -> Mask:
+        down = objects.category[lower]
+        center = _face_center(objects, lower, self.top)
+        reach_x = np.maximum(high[upper, 0] - center[:, 0], center[:, 0] - low[upper, 0])
+        reach_y = np.maximum(high[upper, 1] - center[:, 1], center[:, 1] - low[upper, 1])
+        with np.errstate(invalid="ignore"):
+            larger = np.hypot(reach_x, reach_y) <= self.top.inner[down]
+            return larger & (self.top.hole[down] == 0) & (objects.rotation[lower, 2, 2] > _UPRIGHT)  # type: ignore[no-any-return]
+
+    def tallest(self, objects: Objects, pairs: ObjectPairs) -> Index:
+        """(n,) number of objects that carry each object, one above the other (0 on a fixed surface)."""
+        vertical = (np.abs(pairs.direction[:, 2]) > 0.5) & (pairs.gap < _REACH)
+        a, b = pairs.first[vertical], pairs.second[vertical]
+        first_above = pairs.direction[vertical, 2] < 0
+        upper, lower = np.where(first_above, a, b), np.where(first_above, b, a)
+        depth = np.zeros(len(objects), dtype=np.int64)
+        for index in np.argsort(objects.translation[upper, 2], kind="stable"):
+            if not objects.fixed[lower[index]]:
+                depth[upper[index]] = max(depth[upper[index]], depth[lower[index]] + 1)
+        return depth
+
+
+def clusters(objects: Objects, low: Array, high: Array, sideways: float = _CLEAR) -> Index:
+    """(n,) a number per free object of one scene, shared by those near each other; -1 for fixed ones."""
+    rows = np.flatnonzero(~objects.fixed)
+    margin = np.array([sideways, sideways, _CLEAR_ABOVE])
+    first, second = np.triu_indices(len(rows), k=1)
+    first, second = rows[first], rows[second]
+    near = ((low[first] <= high[second] + margin) & (low[second] <= high[first] + margin)).all(axis=1)
+    return np.where(objects.fixed, -1, components(len(objects), first[near], second[near]))
+
+
+def components(count: int, first: Index, second: Index) -> Index:
+    """(count,) number of the connected component of each node, edges given as (P,), (P,)."""
+    graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)  # type: ignore[no-any-return]
+
+
+def company(objects: Objects, pairs: ObjectPairs, chosen: Mask) -> Mask:
+    """(n,) free objects that must be simulated with the ``chosen`` ones.
+
+    These are objects that touch or nearly touch a chosen object, and the objects on or under those.
+    """
+    free = ~(objects.fixed[pairs.first] | objects.fixed[pairs.second]) & (pairs.gap < _REACH)
+    first, second = pairs.first[free], pairs.second[free]
+    together = chosen.copy()
+    touched = chosen[first] | chosen[second]
+    together[first[touched]] = together[second[touched]] = True
+    vertical = (np.abs(pairs.direction[free, 2]) > 0.5) | (pairs.gap[free] < -_SAME_DEPTH)
+    first, second = first[vertical], second[vertical]
+    while True:
+        touched = together[first] != together[second]
+        if not touched.any():
+            return together
+        together[first[touched]] = together[second[touched]] = True
+
+
+def _face_center(objects: Objects, rows: Index, faces: _Faces) -> Array:
+    """(P, 3) world position of each object's face centre; NaN where it has none."""
+    category = objects.category[rows]
+    local = np.column_stack([faces.center[category], faces.height[category]])
+    r = objects.rotation[rows]
+    moved = r[:, :, 0] * local[:, 0:1] + r[:, :, 1] * local[:, 1:2] + r[:, :, 2] * local[:, 2:3]
+    return moved + objects.translation[rows]  # type: ignore[no-any-return]
