@@ -28,7 +28,6 @@ from multiprocessing.connection import Connection, wait
 from types import MappingProxyType
 from typing import Any
 
-from scene_envs import errors
 from scene_envs.errors import InvalidInputError, MissingDependencyError, PhysicsError, SceneEnvsError
 
 _LOGGER = logging.getLogger(__name__)
@@ -50,6 +49,7 @@ _CODE = (
     "import sys; sys.path[:] = filter(None, sys.path); "  # without the current folder, the first place of imports
     "from scene_envs.workers import serve; serve(*map(int, sys.argv[1:]))"
 )
+_ERRORS = vars(sys.modules[SceneEnvsError.__module__])
 _is_importing_main = False
 
 
@@ -279,7 +279,7 @@ class _Worker:
             body.__cause__ = RuntimeError(f"\n{told}")
         elif kind == "refused" and not isinstance(body, SceneEnvsError):
             names, text = body
-            body = next(getattr(errors, name) for name in names if hasattr(errors, name))(text)
+            body = next(_ERRORS[name] for name in names if name in _ERRORS)(text)
         return kind, body
 
     def _lost(self, how: str, is_late: bool = False) -> tuple[str, WorkerFailure]:
