@@ -31,7 +31,7 @@ def _registries() -> list[dict[str, Any]]:
     from scene_envs.envs.masks import _MASKS
     from scene_envs.export.api import _FORMATS
     from scene_envs.grammars.grammar import GRAMMARS
-    from scene_envs.scene_types.registry import _SCENE_TYPES
+    from scene_envs.scene_types import _SCENE_TYPES
 
     _load_shipped()
     return [_SCENE_TYPES, GRAMMARS, _MASKS, _FORMATS, _REWARDS, _ENTRIES, _PLANNERS, _ALGORITHMS]

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from scene_envs.datasets import SceneDataset, describe_all, generate, judge_scenes
-from scene_envs.datasets.generate import fixed_normalizer
+from scene_envs.datasets.generation import fixed_normalizer
 from scene_envs.grammars import get_grammar
 
 

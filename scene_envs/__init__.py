@@ -2,7 +2,7 @@
 
 Importing this package registers the environments and does nothing more; torch and PyBullet load when an
 environment is built or when a public name is first used. The names below are those that most users need; the packages
-``assets``, ``datasets``, ``envs``, ``export``, ``grammars``, ``physics``, ``render`` and ``scene_types`` have more.
+``assets``, ``datasets``, ``envs``, ``export``, ``grammars``, ``physics`` and ``render`` have more.
 """
 
 from __future__ import annotations

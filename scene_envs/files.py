@@ -1,9 +1,11 @@
-"""Atomic file writes with errors that name the file, and JSON without non-finite numbers."""
+"""Files: atomic writes, digests, the claim of a folder by one writer, tensors, pages, and where scenes are in a folder.
+
+The module does not import torch.
+"""
 
 from __future__ import annotations
 
 import base64
-import contextlib
 import errno
 import hashlib
 import json
@@ -21,13 +23,11 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
-
 from scene_envs.errors import CorruptFileError, InvalidInputError, StorageError
 
 if TYPE_CHECKING:
     from jinja2 import Template
-
+    from torch import Tensor
 
 DIGEST = "sha256"
 """Key of a JSON file that holds the digest of all other keys and their values."""
@@ -231,7 +231,7 @@ def claimed(folder: str | os.PathLike[str], owner: str) -> Iterator[Path]:
         with _guard:
             _held.discard(key)
         if lock >= 0:
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 (folder / LOCK).unlink(missing_ok=True)
             os.close(lock)
 
@@ -241,7 +241,7 @@ def sweep(folder: Path) -> None:
     for path in folder.rglob(".*.partial"):
         found = _PARTIAL.fullmatch(path.name)
         if found is None or int(found["process"]) == os.getpid() or not _is_alive(int(found["process"])):
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 path.unlink()
 
 
@@ -269,7 +269,7 @@ def _lock(path: Path, owner: str) -> int:
                 f"{_SILENCE} s old; give another output, or, if that computer was switched off, wait a minute or "
                 f"remove {str(path)!r}"
             )
-        with contextlib.suppress(FileNotFoundError):
+        with suppress(FileNotFoundError):
             if os.fstat(descriptor).st_ino == os.stat(path).st_ino:  # it was not removed meanwhile
                 text = f"{owner}, process {os.getpid()} on {socket.gethostname()}, since {time.strftime('%F %T')}"
                 os.truncate(descriptor, 0)
@@ -301,7 +301,7 @@ def _heartbeat(descriptor: int) -> Iterator[None]:
 
     def beat() -> None:
         while not done.wait(_BEAT):
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 os.utime(descriptor)
 
     thread = threading.Thread(target=beat, daemon=True)
@@ -321,6 +321,47 @@ def _is_alive(process: int) -> bool:
     except (PermissionError, OverflowError):
         return True
     return True
+
+
+SCENE_FILES = ("ready.safetensors", "scenes.safetensors", "best.safetensors")
+"""Files of a run's folder that hold scenes; the first that exists is taken."""
+_PRIORS = ("prior/config.json", "config.json")
+"""Places of a prior's configuration in a folder."""
+
+
+def find_scenes(path: Path) -> Path:
+    """The file or folder of scenes that ``scenes=`` names; for a run's folder, the scene file in it.
+
+    Raises:
+        InvalidInputError: ``path`` does not exist, or the folder holds a prior and no scenes.
+    """
+    if not exists(path):
+        raise InvalidInputError(
+            f"scenes={str(path)[:200]!r}: no scene file, run or dataset is there; sample and generate make them"
+        )
+    if not path.is_dir():
+        return path
+    found = next((path / name for name in SCENE_FILES if (path / name).is_file()), path)
+    if found == path and any((path / place).is_file() for place in _PRIORS):
+        raise InvalidInputError(
+            f"scenes={str(path)!r} holds a prior and no scenes; draw some, as with scene-envs sample prior={path}"
+        )
+    return found
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a path from :func:`find_scenes` is a dataset or one of its files.
+
+    It is False for a scene file and for a folder of scene files.
+    """
+    return not scene_files(path) if path.is_dir() else path.suffix in (".parquet", ".arrow")
+
+
+def scene_files(folder: Path) -> list[Path]:
+    """Scene files of a folder that holds no dataset, by name."""
+    if any(folder.glob("*.parquet")) or any(folder.glob("*.arrow")):
+        return []
+    return sorted(path for path in folder.glob("[!.]*.safetensors") if path.is_file())
 
 
 @cache
@@ -367,7 +408,6 @@ def write_tensors(
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    path.with_name(f"{path.name}.{DIGEST}").unlink(missing_ok=True)  # the digest of the replaced file
     return path
 
 
@@ -381,7 +421,6 @@ def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[
     from safetensors import SafetensorError, safe_open
 
     path = Path(path)
-    check_digest_file(path)
     try:
         with safe_open(path, "pt") as file:
             metadata = dict(file.metadata() or {})
@@ -394,22 +433,10 @@ def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[
         ) from error
     digest = metadata.pop(DIGEST, None)
     if digest is not None and digest != tensors_digest(tensors, metadata):
-        raise CorruptFileError(_changed(path))
+        raise CorruptFileError(
+            f"{str(path)!r} is damaged: its contents are not what was written (checksum); copy it again or make it anew"
+        )
     return tensors, metadata
-
-
-def check_digest_file(path: Path) -> None:
-    """Verify a file against the digest in the file ``<name>.sha256`` in its folder, if there is one.
-
-    Raises:
-        CorruptFileError: the digests differ.
-    """
-    digest_file = path.with_name(f"{path.name}.{DIGEST}")
-    if not digest_file.is_file() or not path.is_file():
-        return
-    found = hashlib.sha256(path.read_bytes()).hexdigest()
-    if found not in digest_file.read_text(encoding="utf-8", errors="replace").split():
-        raise CorruptFileError(_changed(path))
 
 
 def _in_order(content: bytes) -> bytes:
@@ -430,10 +457,6 @@ def tensors_digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | 
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
         digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def _changed(path: Path) -> str:
-    return f"{str(path)!r} is damaged: its contents are not what was written (checksum); copy it again or make it anew"
 
 
 def _short(error: BaseException) -> str:

@@ -1,17 +1,18 @@
-"""SceneBatch: a batch of scenes, the one data type that crosses module boundaries."""
+"""SceneBatch: a batch of scenes, the one data type that crosses module boundaries; and the distance between scenes."""
 
 from __future__ import annotations
 
 import os
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from scene_envs.arrays import Array, Index
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.files import read_tensors, write_tensors
 from scene_envs.normalizer import Normalizer
@@ -21,171 +22,27 @@ from scene_envs.scene_types import SceneType, get_scene_type
 if TYPE_CHECKING:
     from scene_envs.assets.base import AssetLibrary
 
-
-_CHUNK = 32
-"""Number of scenes whose supports are found together."""
-
-
-class AssetFacts(ABC):
-    """The properties of :class:`~scene_envs.scene.SceneBatch` that depend on the assets themselves.
-
-    All tensors are on the device of the scenes, and 0 or False in empty slots unless stated otherwise. The asset
-    library is built on first use, which raises UnknownNameError for a scene type without models.
-    """
-
-    scene_type: SceneType
-
-    @property
-    @abstractmethod
-    def translations(self) -> Tensor:
-        """(B, N, 3) m, world frame."""
-
-    @property
-    @abstractmethod
-    def rotations(self) -> Tensor:
-        """(B, N, 3, 3), asset frame to world frame."""
-
-    @property
-    @abstractmethod
-    def categories(self) -> Tensor:
-        """(B, N) int64."""
-
-    @property
-    def masses(self) -> Tensor:
-        """(B, N) kg; 0 for static assets.
-
-        >>> from scene_envs import SceneBatch
-        >>> SceneBatch.empty("dimsum_table", 1, slots=2).masses
-        tensor([[0., 0.]])
-        """
-        return self._of_category(_measures(self.scene_type.library)[0])
-
-    @property
-    def volumes(self) -> Tensor:
-        """(B, N) m^3 of material: the sum of the volumes of an object's convex parts; hollows are not counted.
-
-        >>> from scene_envs import SceneBatch
-        >>> SceneBatch.empty("dimsum_table", 1, slots=2).volumes.round(decimals=2)
-        tensor([[0.0400, 0.0000]])
-        """
-        return self._of_category(_measures(self.scene_type.library)[1])
-
-    @property
-    def sizes(self) -> Tensor:
-        """(B, N, 3) m: extents of each object's own box, along the axes of its asset frame.
-
-        >>> from scene_envs import SceneBatch
-        >>> SceneBatch.empty("dimsum_table", 1, slots=2).sizes
-        tensor([[[1.2500, 1.2500, 0.7850],
-                 [0.0000, 0.0000, 0.0000]]])
-        """
-        return self._of_category(_measures(self.scene_type.library)[2])
-
-    @property
-    def bounding_boxes(self) -> Tensor:
-        """(B, N, 2, 3) m, world frame: lowest and highest corner of each object's convex parts at its pose.
-
-        >>> from scene_envs import SceneBatch
-        >>> SceneBatch.empty("dimsum_table", 1, slots=1).bounding_boxes
-        tensor([[[[-0.6250, -0.6250, -0.7850],
-                  [ 0.6250,  0.6250,  0.0000]]]])
-        """
-        categories, device = self.categories, self.translations.device
-        boxes = torch.zeros(*categories.shape, 2, 3, dtype=torch.float64, device=device)
-        for category, corners in enumerate(hull_corners(self.scene_type.library)):
-            here = categories == category
-            if not bool(here.any()):
-                continue
-            points = self.rotations[here].double() @ corners.T.to(device)  # (n, 3, V)
-            low, high = points.amin(dim=-1), points.amax(dim=-1)
-            boxes[here] = torch.stack([low, high], dim=1) + self.translations[here].double().unsqueeze(1)
-        return boxes.float() + 0.0
-
-    @property
-    def supports(self) -> Tensor:
-        """(B, N) int64: slot of the support or container of each object; -1 for none, fixed objects and empty slots.
-
-        Two surfaces touch when they are at most 1 cm apart or at most 1 cm into each other. These are the
-        supports that prompts describe (:func:`scene_envs.datasets.scene_facts`).
-
-        >>> from scene_envs import SceneBatch
-        >>> SceneBatch.empty("dimsum_table", 1, slots=2).supports
-        tensor([[-1, -1]])
-        """
-        from scene_envs.supports import Contacts, Placed
-
-        supports = torch.full(self.categories.shape, -1, dtype=torch.int64)
-        for start in range(0, len(supports), _CHUNK):
-            rows = slice(start, start + _CHUNK)
-            shapes, placed, slot = Placed.of_scenes(
-                self.scene_type,
-                self.categories[rows].cpu().numpy(),
-                self.translations[rows].double().cpu().numpy(),
-                self.rotations[rows].double().cpu().numpy(),
-            )
-            below = Contacts.of(shapes, placed).holding().support
-            held = below >= 0
-            supports[rows][placed.scene[held], slot[held]] = torch.from_numpy(slot[below[held]])
-        return supports.to(self.translations.device)
-
-    def is_any_of(self, *names: str) -> Tensor:
-        """(B, N) bool: slots that hold one of the named assets.
-
-        Args:
-            *names: Asset names, display names ("steamer lid") or groups such as ``"edible"``
-                (:data:`scene_envs.assets.ASSET_GROUPS`).
-
-        Raises:
-            UnknownNameError: a name is none of these; the nearest known one is offered.
-
-        >>> from scene_envs import SceneBatch
-        >>> SceneBatch.empty("dimsum_table", 1, slots=2).is_any_of("furniture")
-        tensor([[ True, False]])
-        """
-        from scene_envs.assets.base import categories_of
-
-        wanted = torch.tensor(categories_of(names, self.scene_type.library), dtype=torch.int64)
-        return torch.isin(self.categories, wanted.to(self.categories.device))
-
-    def _of_category(self, table: Tensor) -> Tensor:
-        """(B, N, ...) rows of a table (C + 1, ...)."""
-        return table.to(self.categories.device)[self.categories]
-
-
-@lru_cache(maxsize=32)
-def _measures(library: AssetLibrary) -> tuple[Tensor, Tensor, Tensor]:
-    """Masses (C + 1,) kg, volumes (C + 1,) m^3 and sizes (C + 1, 3) m by category, empty last."""
-    from scene_envs.assets.shapes import volume
-
-    masses = [*(asset.mass for asset in library), 0.0]
-    volumes = [*(volume(asset.fine) for asset in library), 0.0]
-    sizes = [*((asset.bounds[1] - asset.bounds[0]).tolist() for asset in library), [0.0, 0.0, 0.0]]
-    return torch.tensor(masses), torch.tensor(volumes), torch.tensor(sizes)
-
-
-@lru_cache(maxsize=32)
-def hull_corners(library: AssetLibrary) -> tuple[Tensor, ...]:
-    """Corners (V, 3) of each asset's convex hull, m, float64."""
-    from scene_envs.assets.shapes import hull_of
-
-    return tuple(torch.from_numpy(hull_of(asset.fine).vertices) for asset in library)
-
-
 POSE_FEATURES = 12
 """Numbers of a pose: translation (3) and rotation matrix (9)."""
 POSE = slice(0, POSE_FEATURES)
 TRANSLATION = slice(0, 3)
 ROTATION = slice(3, POSE_FEATURES)
 CATEGORY = slice(POSE_FEATURES, None)
+_CHUNK = 32
+"""Number of scenes whose supports are found together."""
 _ORTHOGONAL = 1e-3
 """Largest entry of R^T R - I of a rotation matrix R."""
 
 
-class SceneBatch(AssetFacts):
+class SceneBatch:
     """B scenes of N slots each, with their scene type.
 
     A slot is translation (m, world frame) | rotation matrix row-major | one-hot over C assets + empty last.
     Empty slots are zeros but for their last entry. The order of slots has no meaning.
+
+    Tensors of properties are on the device of the scenes. Those that depend on the assets themselves (``masses``,
+    ``volumes``, ``sizes``, ``bounding_boxes``, ``supports``, ``is_any_of``) are 0 or False in empty slots unless stated
+    otherwise; the asset library is built on first use, which raises UnknownNameError for a scene type without models.
 
     Args:
         tensor: (B, N, 3 + 9 + C + 1) float32, raw (not normalised) and finite.
@@ -319,6 +176,101 @@ class SceneBatch(AssetFacts):
         inside = ((self.translations >= low) & (self.translations <= high)).all(dim=-1)
         return inside & ~self.is_empty
 
+    @property
+    def masses(self) -> Tensor:
+        """(B, N) kg; 0 for static assets.
+
+        >>> SceneBatch.empty("dimsum_table", 1, slots=2).masses
+        tensor([[0., 0.]])
+        """
+        return self._of_category(_measures(self.scene_type.library)[0])
+
+    @property
+    def volumes(self) -> Tensor:
+        """(B, N) m^3 of material: the sum of the volumes of an object's convex parts; hollows are not counted.
+
+        >>> SceneBatch.empty("dimsum_table", 1, slots=2).volumes.round(decimals=2)
+        tensor([[0.0400, 0.0000]])
+        """
+        return self._of_category(_measures(self.scene_type.library)[1])
+
+    @property
+    def sizes(self) -> Tensor:
+        """(B, N, 3) m: extents of each object's own box, along the axes of its asset frame.
+
+        >>> SceneBatch.empty("dimsum_table", 1, slots=2).sizes
+        tensor([[[1.2500, 1.2500, 0.7850],
+                 [0.0000, 0.0000, 0.0000]]])
+        """
+        return self._of_category(_measures(self.scene_type.library)[2])
+
+    @property
+    def bounding_boxes(self) -> Tensor:
+        """(B, N, 2, 3) m, world frame: lowest and highest corner of each object's convex parts at its pose.
+
+        >>> SceneBatch.empty("dimsum_table", 1, slots=1).bounding_boxes
+        tensor([[[[-0.6250, -0.6250, -0.7850],
+                  [ 0.6250,  0.6250,  0.0000]]]])
+        """
+        categories, device = self.categories, self.translations.device
+        boxes = torch.zeros(*categories.shape, 2, 3, dtype=torch.float64, device=device)
+        for category, corners in enumerate(hull_corners(self.scene_type.library)):
+            here = categories == category
+            if not bool(here.any()):
+                continue
+            points = self.rotations[here].double() @ corners.T.to(device)  # (n, 3, V)
+            low, high = points.amin(dim=-1), points.amax(dim=-1)
+            boxes[here] = torch.stack([low, high], dim=1) + self.translations[here].double().unsqueeze(1)
+        return boxes.float() + 0.0
+
+    @property
+    def supports(self) -> Tensor:
+        """(B, N) int64: slot of the support or container of each object; -1 for none, fixed objects and empty slots.
+
+        Two surfaces touch when they are at most 1 cm apart or at most 1 cm into each other. These are the
+        supports that prompts describe (:func:`scene_envs.datasets.scene_facts`).
+
+        >>> SceneBatch.empty("dimsum_table", 1, slots=2).supports
+        tensor([[-1, -1]])
+        """
+        from scene_envs.supports import Contacts, Placed
+
+        supports = torch.full(self.categories.shape, -1, dtype=torch.int64)
+        for start in range(0, len(supports), _CHUNK):
+            rows = slice(start, start + _CHUNK)
+            shapes, placed, slot = Placed.of_scenes(
+                self.scene_type,
+                self.categories[rows].cpu().numpy(),
+                self.translations[rows].double().cpu().numpy(),
+                self.rotations[rows].double().cpu().numpy(),
+            )
+            below = Contacts.of(shapes, placed).holding().support
+            held = below >= 0
+            supports[rows][placed.scene[held], slot[held]] = torch.from_numpy(slot[below[held]])
+        return supports.to(self.translations.device)
+
+    def is_any_of(self, *names: str) -> Tensor:
+        """(B, N) bool: slots that hold one of the named assets.
+
+        Args:
+            *names: Asset names, display names ("steamer lid") or groups such as ``"edible"``
+                (:data:`scene_envs.assets.ASSET_GROUPS`).
+
+        Raises:
+            UnknownNameError: a name is none of these; the nearest known one is offered.
+
+        >>> SceneBatch.empty("dimsum_table", 1, slots=2).is_any_of("furniture")
+        tensor([[ True, False]])
+        """
+        from scene_envs.assets.base import categories_of
+
+        wanted = torch.tensor(categories_of(names, self.scene_type.library), dtype=torch.int64)
+        return torch.isin(self.categories, wanted.to(self.categories.device))
+
+    def _of_category(self, table: Tensor) -> Tensor:
+        """(B, N, ...) rows of a table (C + 1, ...)."""
+        return table.to(self.categories.device)[self.categories]
+
     def names(self) -> list[list[str]]:
         """Asset names of the non-empty slots, per scene, in slot order."""
         assets, empty = self.scene_type.assets, self.scene_type.num_assets
@@ -381,6 +333,25 @@ class SceneBatch(AssetFacts):
             raise CorruptFileError(f"{str(path)!r} is not a scene file written by SceneBatch.save: {error}") from error
 
 
+@lru_cache(maxsize=32)
+def _measures(library: AssetLibrary) -> tuple[Tensor, Tensor, Tensor]:
+    """Masses (C + 1,) kg, volumes (C + 1,) m^3 and sizes (C + 1, 3) m by category, empty last."""
+    from scene_envs.assets.shapes import volume
+
+    masses = [*(asset.mass for asset in library), 0.0]
+    volumes = [*(volume(asset.fine) for asset in library), 0.0]
+    sizes = [*((asset.bounds[1] - asset.bounds[0]).tolist() for asset in library), [0.0, 0.0, 0.0]]
+    return torch.tensor(masses), torch.tensor(volumes), torch.tensor(sizes)
+
+
+@lru_cache(maxsize=32)
+def hull_corners(library: AssetLibrary) -> tuple[Tensor, ...]:
+    """Corners (V, 3) of each asset's convex hull, m, float64."""
+    from scene_envs.assets.shapes import hull_of
+
+    return tuple(torch.from_numpy(hull_of(asset.fine).vertices) for asset in library)
+
+
 def require_rigid_poses(batch: SceneBatch) -> None:
     """Raise InvalidInputError for a pose that is not finite, and for a matrix that is not a rotation."""
     present = ~batch.is_empty
@@ -407,4 +378,96 @@ def _require_scene_tensor(tensor: Tensor, scene_type: SceneType) -> None:
         raise InvalidInputError(
             f"scene tensor holds {tensor[scene, slot, feature].item()} at scene {scene}, slot {slot}, "
             f"feature {feature}; all values must be finite"
+        )
+
+
+PlacedObjects = tuple[Index, Array]
+"""Objects of one scene: categories (n,), ascending, and positions (n, 3) m."""
+
+
+def cutoff(scene_type: SceneType) -> float:
+    """The cost (m) of an object without counterpart: a quarter of the longer horizontal side of the workspace.
+
+    >>> cutoff(get_scene_type("dimsum_table"))
+    0.245
+    """
+    low, high = scene_type.workspace
+    return 0.25 * max(high[0] - low[0], high[1] - low[1])
+
+
+def scene_distances(batch: SceneBatch, other: SceneBatch) -> Tensor:
+    """(B,) m: distance of each scene from its counterpart in ``other``, as sets of objects; orientations do not count.
+
+    This is the OSPA distance of order 1 (Schuhmacher, Vo and Vo, 2008). Objects are matched one to one at the least
+    total cost. A match costs the distance of the two positions, at most c, or c when the assets differ. Each object
+    without a match costs c. The total is divided by the number of objects of the larger scene. Fixed welded objects
+    are left out; c is :func:`cutoff`. The assignment is exact: it is the limit of Sinkhorn iterations as their
+    regularisation goes to zero.
+
+    >>> from scene_envs.grammars import get_grammar
+    >>> scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 2)
+    >>> shuffled = SceneBatch(scenes.tensor.flip(1), scenes.scene_type)
+    >>> scene_distances(shuffled, scenes)
+    tensor([0., 0.], dtype=torch.float64)
+
+    Raises:
+        InvalidInputError: another number of scenes, or scenes of other assets.
+    """
+    check_same_assets(batch, other)
+    if len(batch) != len(other):
+        raise InvalidInputError(f"{len(batch)} scenes have no counterparts in {len(other)}; give as many")
+    limit = cutoff(batch.scene_type)
+    pairs = zip(SceneObjects(batch), SceneObjects(other), strict=True)
+    return torch.tensor([matching_distance(first, second, limit) for first, second in pairs], dtype=torch.float64)
+
+
+class SceneObjects:
+    """The counted objects of each scene of a batch, sorted by category; each scene is computed on first use."""
+
+    def __init__(self, batch: SceneBatch) -> None:
+        self._present = counted_objects(batch).cpu().numpy()
+        self._categories = batch.categories.cpu().numpy()
+        self._positions = batch.translations.double().cpu().numpy()
+        self._known: dict[int, PlacedObjects] = {}
+
+    def __len__(self) -> int:
+        return len(self._present)
+
+    def __iter__(self) -> Iterator[PlacedObjects]:
+        return (self[row] for row in range(len(self)))
+
+    def __getitem__(self, row: int) -> PlacedObjects:
+        if row not in self._known:
+            slots = np.flatnonzero(self._present[row])
+            slots = slots[np.argsort(self._categories[row, slots], kind="stable")]
+            self._known[row] = self._categories[row, slots], self._positions[row, slots]
+        return self._known[row]
+
+
+def counted_objects(batch: SceneBatch) -> Tensor:
+    """(B, N) bool: objects without the fixed welded ones that are in every scene."""
+    fixed = torch.tensor(batch.scene_type.fixed_categories, dtype=torch.long, device=batch.tensor.device)
+    return ~batch.is_empty & ~torch.isin(batch.categories, fixed)
+
+
+def matching_distance(first: PlacedObjects, second: PlacedObjects, limit: float) -> float:
+    """Distance (m) of two scenes, as in :func:`scene_distances`; ``limit`` (m) is the cost of an unmatched object."""
+    from scipy.optimize import linear_sum_assignment
+
+    count, larger = len(first[0]), max(len(first[0]), len(second[0]))
+    if not larger:
+        return 0.0
+    apart = np.sqrt(((first[1][:, None] - second[1][None]) ** 2).sum(axis=-1))
+    cost = np.where(first[0][:, None] == second[0][None], np.minimum(apart, limit), limit)
+    rows, columns = linear_sum_assignment(cost)
+    matched = float(cost[rows, columns].sum())
+    return (matched + limit * (larger - min(count, len(second[0])))) / larger
+
+
+def check_same_assets(batch: SceneBatch, other: SceneBatch) -> None:
+    """Raise InvalidInputError when two batches hold scenes of other assets."""
+    if batch.scene_type.assets != other.scene_type.assets:
+        raise InvalidInputError(
+            f"scenes of {batch.scene_type.name!r} cannot be compared with scenes of {other.scene_type.name!r}: "
+            "their assets differ"
         )

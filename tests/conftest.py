@@ -15,11 +15,11 @@ from PIL import Image
 
 def pytest_collection_finish() -> None:
     """The ranges of a built-in grammar are measured once per process, on fewer objects: that takes seconds."""
-    ranges = sys.modules.get("scene_envs.datasets.generate")
+    ranges = sys.modules.get("scene_envs.datasets.generation")
     if ranges is None:  # nothing that was collected generates
         return
     from scene_envs.grammars.grammar import Grammar
-    from scene_envs.scene_types.registry import BUILT_IN
+    from scene_envs.scene_types import BUILT_IN
 
     names, measure = {scene_type.name for scene_type in BUILT_IN}, ranges._ranges
     known: dict[str, tuple[Any, Any, bool]] = {}

@@ -45,8 +45,7 @@ from scene_envs.errors import (
     UnknownNameError,
     unknown_name,
 )
-from scene_envs.files import exists, is_file
-from scene_envs.scene_sources import find_scenes
+from scene_envs.files import exists, find_scenes, is_file
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 

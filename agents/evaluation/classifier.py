@@ -12,8 +12,7 @@ from torch.nn import functional as F
 
 from agents.evaluation.set_network import SceneTokens, SetNetwork, TypicalPlaces, blurred, scene_tokens
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import SceneBatch
-from scene_envs.scene_distance import check_same_assets
+from scene_envs.scene import SceneBatch, check_same_assets
 
 MIN_SCENES = 20
 """Smallest number of scenes of each class with which a classifier is trained."""

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from scene_envs.arrays import Array, Index
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import SceneBatch
-from scene_envs.scene_distance import (
+from scene_envs.scene import (
     PlacedObjects,
+    SceneBatch,
     SceneObjects,
     check_same_assets,
     counted_objects,
@@ -100,7 +100,7 @@ class Neighbors:
     """The nearest scene to each of B scenes.
 
     Attributes:
-        distance: (B,) m, distance to the nearest scene; see :func:`scene_envs.scene_distance.scene_distances`.
+        distance: (B,) m, distance to the nearest scene; see :func:`scene_envs.scene.scene_distances`.
         index: (B,) int64, index of the nearest scene.
         copied: (B,) bool, whether one of the other scenes has the same assets, each within 1 cm of its counterpart.
 
@@ -118,7 +118,7 @@ class Neighbors:
 
 def nearest_scenes(batch: SceneBatch, others: SceneBatch, *, candidates: int = CANDIDATES) -> Neighbors:
     """The scene of ``others`` that is nearest to each scene of ``batch``, by its :func:`distance
-    <scene_envs.scene_distance.scene_distances>`.
+    <scene_envs.scene.scene_distances>`.
 
     The distance is computed exactly for the ``candidates`` scenes that are nearest by features. A feature is the sum of
     a function of the position over all objects of one asset. The functions are bounded and have slope 1 at most, so
@@ -233,7 +233,7 @@ def tallest_stacks(batch: SceneBatch) -> Tensor:
     """Number of objects in the tallest stack of each scene, (B,) int64.
 
     A stack is a chain of free objects, each standing on the one below or lying in it
-    (:attr:`SceneBatch.supports <scene_envs.scene.AssetFacts.supports>`). A lone object is a stack of one.
+    (:attr:`SceneBatch.supports <scene_envs.scene.SceneBatch.supports>`). A lone object is a stack of one.
     A scene without free objects has 0.
 
     >>> tallest_stacks(SceneBatch.empty("dimsum_table", 2)).tolist()

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from agents.evaluation.layouts import CONTAINERS, SUPPORTS, Container, Support
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import SceneBatch
-from scene_envs.scene_distance import check_same_assets
+from scene_envs.scene import SceneBatch, check_same_assets
 
 KL_EPS = 1e-6
 """Probability added to every category before renormalising, so that the KL is finite if a category is never sampled."""

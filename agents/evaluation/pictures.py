@@ -16,8 +16,7 @@ from torch.nn import functional as F
 from agents.evaluation.classifier import Accuracy, ClassifierConfig, Forward, Split, check_classes, two_sample_accuracy
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 from scene_envs.files import read_tensors
-from scene_envs.scene import SceneBatch
-from scene_envs.scene_distance import check_same_assets
+from scene_envs.scene import SceneBatch, check_same_assets
 
 if TYPE_CHECKING:
     from agents.evaluation.set_encoder import SetEncoder

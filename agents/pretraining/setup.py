@@ -23,7 +23,7 @@ from agents.priors.files import PriorFacts
 from agents.priors.prior import ScenePrior
 from scene_envs.datasets import SceneDataset, to_union
 from scene_envs.datasets.dataset import union_normalizer
-from scene_envs.datasets.generate import fixed_normalizer
+from scene_envs.datasets.generation import fixed_normalizer
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar

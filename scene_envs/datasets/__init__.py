@@ -1,10 +1,9 @@
 """Datasets of scenes: generation from grammars, files, prompts, unions."""
 
-from scene_envs.datasets.dataset import SceneDataset, to_union
+from scene_envs.datasets.dataset import SceneDataset, load_scenes, to_union
 from scene_envs.datasets.files import DatasetInfo, read_metadata
-from scene_envs.datasets.generate import GenerationReport, generate
+from scene_envs.datasets.generation import GenerationReport, generate, judge_scenes
 from scene_envs.datasets.prompts import PromptFacts, SceneFacts, describe, describe_all, parse_prompt, scene_facts
-from scene_envs.datasets.shards import judge_scenes
 from scene_envs.errors import StorageError
 
 __all__ = [
@@ -18,6 +17,7 @@ __all__ = [
     "describe_all",
     "generate",
     "judge_scenes",
+    "load_scenes",
     "parse_prompt",
     "read_metadata",
     "scene_facts",

@@ -30,7 +30,7 @@ from scene_envs.datasets.files import (
     write_shard,
 )
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
-from scene_envs.files import with_digest, write_json
+from scene_envs.files import find_scenes, is_dataset, scene_files, with_digest, write_json
 from scene_envs.normalizer import Normalizer
 from scene_envs.rotations import project_to_so3
 from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, ROTATION, SceneBatch
@@ -548,3 +548,29 @@ def union_normalizer(normalizers: Sequence[Normalizer], union: SceneType) -> Nor
     low[POSE] = torch.stack([n.input_min[POSE] for n in normalizers]).amin(dim=0)
     high[POSE] = torch.stack([n.input_max[POSE] for n in normalizers]).amax(dim=0)
     return Normalizer.from_range(low, high)
+
+
+def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
+    """Scenes from a scene file, a folder of them, a run's folder with a scene file, a dataset or a file of a dataset.
+
+    Args:
+        path: File or folder.
+        count: Largest number of scenes, the first ones; None for all. Files are read in order of name.
+
+    Raises:
+        InvalidInputError: ``count`` is below 1, ``path`` does not exist, or its files are of several scene types.
+    """
+    if count is not None and count < 1:
+        raise InvalidInputError(f"count must be at least 1, or null for all, got {count}")
+    path = find_scenes(path)
+    if is_dataset(path):
+        return SceneDataset.load(path, limit=count).batch()
+    files = scene_files(path) if path.is_dir() else [path]
+    batches = [SceneBatch.load(file) for file in files]
+    names = sorted({batch.scene_type.name for batch in batches})
+    if len(names) > 1:
+        raise InvalidInputError(
+            f"the scene files of {str(path)!r} are of several scene types, {', '.join(names)}; name one of the files"
+        )
+    slots = max(batch.tensor.shape[1] for batch in batches)
+    return SceneBatch.concatenate([batch.with_slots(slots) for batch in batches])[:count]

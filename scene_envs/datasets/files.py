@@ -138,12 +138,6 @@ def open_parquet(path: Path) -> pq.ParquetFile:
         ) from error
 
 
-def remove_partial(folder: Path) -> None:
-    """Remove files that killed processes left half-written in ``folder``."""
-    for path in folder.glob(".*.partial"):
-        path.unlink(missing_ok=True)
-
-
 _STATE, _SPLITS = "state.json", "dataset_dict.json"
 _SUFFIXES = (".parquet", ".arrow")
 BLOCK = 2000

@@ -15,8 +15,7 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.grammars.layout import Frame, Layout, Pose, Surface, Tower
 from scene_envs.registry import Registry
 from scene_envs.scene import POSE, POSE_FEATURES, SceneBatch
-from scene_envs.scene_types import SceneType, get_scene_type
-from scene_envs.scene_types.registry import BUILT_IN, PLUGINS
+from scene_envs.scene_types import BUILT_IN, PLUGINS, SceneType, get_scene_type
 
 _MAX_STRUCTURES = 10_000
 """Number of structures drawn for one scene before an error that the grammar is impossible."""

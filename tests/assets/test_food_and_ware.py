@@ -16,8 +16,7 @@ from scene_envs.assets import get_library, list_assets
 from scene_envs.physics import equilibrium, feasibility, penetration, project, settle
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import Camera, FixedObject, SceneType
-from scene_envs.scene_types.registry import BUILT_IN
+from scene_envs.scene_types import BUILT_IN, Camera, FixedObject, SceneType
 
 SIZES = {  # (x, y, z) m, handles aside
     "cereal_box": (0.19, 0.06, 0.28),

@@ -10,10 +10,10 @@ import torch
 
 from agents.cli import main
 from agents.priors.testing import tiny_prior
+from scene_envs.datasets import load_scenes
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_sources import load_scenes
 
 OWN_WORDS = {
     "project": ["workers=0", "pictures=0"],

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from scene_envs.datasets import SceneDataset, generate, judge_scenes
-from scene_envs.datasets import shards as shards_module
-from scene_envs.datasets.shards import generation_progress
+from scene_envs.datasets import generation
+from scene_envs.datasets.generation import generation_progress
 from scene_envs.errors import InvalidInputError, PhysicsError, UnknownNameError
 from scene_envs.grammars import register_grammar
 from tests.helpers.toy_grammars import CUPS_COUNT, ToyGrammar, generate_cups, toy_cups
@@ -102,17 +102,15 @@ def test_a_grammar_that_workers_cannot_import_is_refused_with_the_remedy(tmp_pat
 def test_a_grammar_of_which_nothing_passes_is_given_up_with_the_reasons(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shards_module, "_MAX_FRUITLESS", 40)
+    monkeypatch.setattr(generation, "_MAX_FRUITLESS", 40)
     with pytest.raises(PhysicsError, match="outside workspace"):
         generate_cups(tmp_path, grammar="toy_hopeless")
 
 
 def test_a_log_gets_lines_with_rate_and_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
-    from scene_envs.datasets import shards as progress
-
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setattr(progress, "_EVERY", 0.0)
+    monkeypatch.setattr(generation, "_EVERY", 0.0)
     with generation_progress("Generating tea", 100, 1000, True) as report:
         report(10, 12, {"penetration": 2})
         report(5, 6, {"no room": 7})

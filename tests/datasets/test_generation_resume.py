@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from scene_envs.datasets import SceneDataset, StorageError, judge_scenes
-from scene_envs.datasets import shards as shards_module
+from scene_envs.datasets import generation
 from scene_envs.errors import CorruptFileError
 from scene_envs.scene import SceneBatch
 from tests.helpers.forked import forked
@@ -41,8 +41,8 @@ def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch], list[str]])
         return verdicts(batch)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shards_module, "judge_scenes", judge)
-        patch.setattr(shards_module, "_MAX_CHUNK", 5)
+        patch.setattr(generation, "judge_scenes", judge)
+        patch.setattr(generation, "_MAX_CHUNK", 5)
         with pytest.raises(_Killed):
             generate_cups(output)
 
@@ -52,8 +52,8 @@ def _generate_slowly(output: Path) -> None:
         time.sleep(0.05)
         return judge_scenes(batch)
 
-    shards_module.judge_scenes = slowly
-    shards_module._MAX_CHUNK = 4
+    generation.judge_scenes = slowly
+    generation._MAX_CHUNK = 4
     generate_cups(output)
 
 
@@ -90,8 +90,8 @@ def test_what_was_judged_before_a_kill_is_not_judged_again(
         counted += len(batch)
         return judge_scenes(batch)
 
-    monkeypatch.setattr(shards_module, "judge_scenes", count)
-    monkeypatch.setattr(shards_module, "_MAX_CHUNK", 1)
+    monkeypatch.setattr(generation, "judge_scenes", count)
+    monkeypatch.setattr(generation, "_MAX_CHUNK", 1)
     report = generate_cups(tmp_path)
     assert counted == report.tried - known
     assert _hashes(tmp_path) == _hashes(cups)
@@ -101,7 +101,7 @@ def test_what_was_judged_before_a_kill_is_not_judged_again(
 def test_the_result_does_not_depend_on_the_size_of_chunks(
     cups: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shards_module, "_MAX_CHUNK", 7)
+    monkeypatch.setattr(generation, "_MAX_CHUNK", 7)
     generate_cups(tmp_path)
     assert _hashes(tmp_path) == _hashes(cups)
 
@@ -181,14 +181,14 @@ def test_a_broken_shard_is_named_before_work_starts(cups: Path, tmp_path: Path) 
 @pytest.mark.slow
 def test_slow_grammars_report_scene_by_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cups: Path) -> None:
     """When a scene takes as long as a chunk may, chunks have one scene."""
-    monkeypatch.setattr(shards_module, "_CHUNK_SECONDS", 0.0)
+    monkeypatch.setattr(generation, "_CHUNK_SECONDS", 0.0)
     chunks: list[int] = []
 
     def judge(batch: SceneBatch) -> list[str]:
         chunks.append(len(batch))
         return judge_scenes(batch)
 
-    monkeypatch.setattr(shards_module, "judge_scenes", judge)
+    monkeypatch.setattr(generation, "judge_scenes", judge)
     generate_cups(tmp_path)
     assert set(chunks) == {1}
     assert _hashes(tmp_path) == _hashes(cups)
@@ -202,4 +202,4 @@ def test_a_grammar_that_was_changed_since_is_judged_anew(tmp_path: Path, monkeyp
         _generate_and_die(tmp_path, lambda batch: ["kept"] * len(batch))
     generate_cups(tmp_path)
     batch = SceneDataset.load(tmp_path).batch()
-    assert set(judge_scenes(batch)) == {shards_module.KEPT}
+    assert set(judge_scenes(batch)) == {generation.KEPT}

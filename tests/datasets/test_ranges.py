@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from scene_envs.datasets import SceneDataset
-from scene_envs.datasets.generate import fixed_normalizer
-from scene_envs.datasets.shards import judge_scenes
+from scene_envs.datasets.generation import fixed_normalizer, judge_scenes
 from scene_envs.grammars import get_grammar, register_grammar
 from scene_envs.scene import SceneBatch
 from tests.helpers.toy_grammars import TYPE, ToyGrammar, generate_cups

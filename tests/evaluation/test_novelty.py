@@ -9,8 +9,7 @@ import torch
 from agents.evaluation import grammar_scenes, nearest_scenes, novelty
 from agents.evaluation.layouts import Neighbors, duplicates
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import SceneBatch
-from scene_envs.scene_distance import cutoff, scene_distances
+from scene_envs.scene import SceneBatch, cutoff, scene_distances
 
 
 @pytest.fixture(scope="module")

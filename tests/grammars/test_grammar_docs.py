@@ -14,7 +14,7 @@ from scene_envs import grammars
 from scene_envs.datasets import judge_scenes
 from scene_envs.grammars import Grammar
 from scene_envs.grammars.grammar import GRAMMARS
-from scene_envs.scene_types import registry
+from scene_envs import scene_types
 
 PAGE = (Path(__file__).parents[2] / "docs" / "grammars.md").read_text()
 BLOCKS = [block for block in re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL) if "gym.make" not in block]
@@ -25,7 +25,7 @@ def page() -> Any:
     """The names that the page defines, its blocks run in order."""
     names: dict[str, Any] = {}
     grammars.list_grammars()  # the built-in ones are registered for good, before the registry is swapped
-    with patch.dict(registry._SCENE_TYPES), patch.dict(GRAMMARS):
+    with patch.dict(scene_types._SCENE_TYPES), patch.dict(GRAMMARS):
         for block in BLOCKS:
             exec(compile(block, "docs/grammars.md", "exec"), names)
     return names

@@ -9,7 +9,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.datasets.shards import judge_scenes
+from scene_envs.datasets.generation import judge_scenes
 from scene_envs.grammars import Grammar
 from scene_envs.grammars.layout import Containers
 from scene_envs.scene import SceneBatch

@@ -16,8 +16,7 @@ from scene_envs.physics import equilibrium, feasibility, make_ready, penetration
 from scene_envs.physics.api import run_kernel, spent, stack
 from scene_envs.physics.placement import MAX_PER_OBJECT, MIN_UNITS, PER_OBJECT, PER_PAIR, PER_SCENE
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import get_scene_type
-from scene_envs.scene_types.registry import BUILT_IN
+from scene_envs.scene_types import BUILT_IN, get_scene_type
 
 pytestmark = pytest.mark.slow
 

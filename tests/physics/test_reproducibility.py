@@ -14,7 +14,7 @@ from scene_envs.grammars import get_grammar
 from scene_envs.physics import PhysicsPool, feasibility, settle
 from scene_envs.physics.motion import physics_of
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types.registry import BUILT_IN
+from scene_envs.scene_types import BUILT_IN
 
 pytestmark = pytest.mark.slow
 TYPE = "dimsum_table"

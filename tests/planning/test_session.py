@@ -17,9 +17,9 @@ from agents.planning import PlanResult, Session, run_search
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput, register_reward
+from scene_envs.datasets import load_scenes
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_sources import load_scenes
 from tests.helpers.toy_tree import ToyTree, scrambled
 
 SETTINGS: dict[str, Any] = {"budget": 15, "branching": 3, "num_steps": 2, "seed": 3, "baseline": False, "slots": 12}

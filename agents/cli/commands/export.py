@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from agents.cli.commands.scenes import make_ready
 from agents.configuration.composition import DrawKeys
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -120,4 +119,6 @@ def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
         ).to("cpu")
         batch.save(run.directory / "scenes.safetensors")
         return batch
+    from scene_envs.datasets import load_scenes
+
     return load_scenes(Path(settings.scenes), settings.count)

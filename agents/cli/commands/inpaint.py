@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from agents.cli.commands.scenes import draw_scenes
 from agents.configuration.composition import DeviceKeys
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -94,6 +93,8 @@ def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[Sce
         seed, strength = derived_seed(settings.seed, 1), settings.physics_guidance
         batch = fresh.sample(count, num_steps=settings.num_steps, seed=seed, physics_guidance=strength)
         return fresh, batch.to("cpu")
+    from scene_envs.datasets import load_scenes
+
     batch = load_scenes(Path(settings.scenes), settings.count)
     if not len(batch):
         raise InvalidInputError(f"{command}: scenes={settings.scenes!r} holds no scene")

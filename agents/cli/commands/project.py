@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from agents.cli.commands.scenes import draw_scenes, make_ready
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -41,6 +40,7 @@ def check(settings: ProjectConfig) -> None:
 
 def run(settings: ProjectConfig, run: Run) -> None:
     """Project and settle the scenes, and count the ready objects."""
+    from scene_envs.datasets import load_scenes
     from scene_envs.physics import PhysicsPool
 
     batch = load_scenes(Path(settings.scenes), settings.count)

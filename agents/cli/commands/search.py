@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from agents.configuration.composition import DeviceKeys, ProgressKeys, RewardLimits, composed, named
 from agents.planning.settings import SearchConfig
-from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -49,6 +48,7 @@ def run(settings: SearchKeys, run: Run) -> None:
     from agents.priors.prior import ScenePrior
     from agents.utils.interrupts import Terminated
     from rewards.process import close_reward, is_foreign, run_reward
+    from scene_envs.datasets import load_scenes
 
     search = SearchConfig(**{field.name: getattr(settings, field.name) for field in fields(SearchConfig)})
     limits = {"timeout": settings.reward_timeout, "memory": settings.reward_memory}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.configuration.composition import DrawKeys, named
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene_sources import find_scenes, is_dataset, load_scenes
+from scene_envs.files import find_scenes, is_dataset
 
 if TYPE_CHECKING:
     from agents.cli.run_folder import Run
@@ -103,14 +103,14 @@ def _gather(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
 
 def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
     """Scenes ``first`` to ``first + count`` of a scene file or a dataset, whose captions are its prompts."""
+    from scene_envs.datasets import SceneDataset, load_scenes
+
     path = find_scenes(Path(settings.scenes))
     chosen = slice(settings.first, settings.first + settings.count)
     if not is_dataset(path):
         everything, captions = load_scenes(path), None
         total, batch = len(everything), everything[chosen]
     else:
-        from scene_envs.datasets import SceneDataset
-
         dataset = SceneDataset.load(path, scene_type=settings.scene or None, limit=chosen.stop)
         total, captions = len(dataset), dataset.prompts[chosen]
         batch = dataset.batch(chosen)
