@@ -40,7 +40,6 @@ _ALARM = 5.0
 """Seconds after its deadline at which a process ends itself, if its parent has not ended it."""
 _MAX_TEXT = 2000
 """Largest number of characters of an error message from a worker."""
-_KINDS = ("report", "done", "refused", "failed")
 _DISTURBED = (
     "disturbed the answers of its process, which was ended; its code may write to and close no file descriptor that it "
     "did not open"
@@ -54,12 +53,7 @@ _is_importing_main = False
 
 
 class WorkerFailure(Exception):
-    """Reason why a task has no result, as the predicate of a sentence about the task.
-
-    Args:
-        text: the predicate.
-        is_late: whether the deadline was over.
-    """
+    """Reason why a task has no result, as the predicate of a sentence about the task; late after its deadline."""
 
     def __init__(self, text: str, is_late: bool = False) -> None:
         super().__init__(text)
@@ -83,24 +77,15 @@ class Task:
     split: Callable[[], Sequence[Task]] | None = None
 
 
-# -- in the worker ------------------------------------------------------------------------------------
-
-
 class _Target:
-    """A target in its worker.
-
-    Args:
-        here: whether this is the process of the pool itself, where exits and interrupts are raised.
-        paths: further places of imports, for machines that share a disk.
-    """
+    """A target in its worker; ``here`` is the process of the pool itself, where exits and interrupts are raised."""
 
     def __init__(self, here: bool = False, paths: Sequence[str] = ()) -> None:
-        sys.path.extend(path for path in paths if path not in sys.path)
+        sys.path.extend(path for path in paths if path not in sys.path)  # for machines that share a disk
         self._here = here
         self._answer: Callable[[Any], Any] | None = None
 
     def process_id(self) -> int:
-        """Id of this process in the operating system."""
         return os.getpid()
 
     def messages(self, body: Any) -> Iterator[tuple[str, Any]]:
@@ -192,26 +177,15 @@ def import_main(main: Mapping[str, Any]) -> None:
         _is_importing_main = False
 
 
-# -- in the parent ------------------------------------------------------------------------------------
-
-
 class _Worker:
-    """State of one worker; subclasses send to it, receive from it and end it.
+    """One worker as its parent sees it; subclasses send to it, receive from it and end it."""
 
-    Attributes:
-        is_alive: False once it was ended.
-        is_ready: whether it has started, and has taken in what it was sent once.
-        known: keys of what it was sent once.
-        task: what the pool keeps about the task that it works on.
-        source: object that is ready for reading when the worker has answered or ended.
-    """
-
-    source: Any
+    source: Any  # ready for reading when the worker has answered or ended
 
     def __init__(self) -> None:
-        self.is_alive, self.is_ready = True, False
-        self.known: set[Hashable] = set()
-        self.task: Any = None
+        self.is_alive, self.is_ready = True, False  # ready: it has started, and has taken in what it was sent once
+        self.known: set[Hashable] = set()  # keys of what it was sent once
+        self.task: Any = None  # what the pool keeps about the task that it works on
         self._is_late = False
         self._timeout: float | None = None
         self._clock: threading.Timer | None = None
@@ -352,7 +326,7 @@ class Process(_Worker):
     def receive(self) -> tuple[str, Any]:
         try:
             number, kind, body = self.source.recv()
-            if number != self._number or kind not in _KINDS:
+            if number != self._number or kind not in ("report", "done", "refused", "failed"):
                 return self._lost(_DISTURBED)
         except (EOFError, OSError):
             with contextlib.suppress(subprocess.TimeoutExpired):
