@@ -1,4 +1,4 @@
-"""A dataset in memory: raw scenes, prompts, normalizer."""
+"""Datasets in memory: raw scenes with prompts and normalizer, their parts, and scenes in the categories of a union."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import logging
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,9 @@ from scene_envs.datasets.files import (
     Rows,
     find_files,
     find_metadata,
-    list_blocks,
     make_metadata,
-    read_block,
     read_metadata,
+    read_rows,
     shard_name,
     to_rows,
     write_shard,
@@ -34,8 +34,11 @@ from scene_envs.files import find_scenes, is_dataset, scene_files, with_digest, 
 from scene_envs.normalizer import Normalizer
 from scene_envs.rotations import project_to_so3
 from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, ROTATION, SceneBatch
-from scene_envs.scene_types import FixedObject, SceneType, get_scene_type
+from scene_envs.scene_types import SceneType, get_scene_type
 
+_LOGGER = logging.getLogger(__name__)
+Keys = NDArray[np.uint64]
+"""(M,) keys of scenes, as of :func:`scene_keys`."""
 FIXED_TOLERANCE = 1e-3
 """Largest difference (m, and entries of the rotation matrix) of a fixed object's pose from the scene type's."""
 _ONE_HOT = 0.1
@@ -44,247 +47,6 @@ _ROTATION = 0.05
 """Largest difference of R^T R from the identity per entry; above 1e-5, the matrix is projected to SO(3)."""
 _KEYS_AT_ONCE = 1024
 """Scenes whose keys are computed together: small enough for the processor's cache."""
-
-
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """Conversion of the files of one dataset to scenes of a scene type.
-
-    Attributes:
-        info: Metadata of the files.
-        scene_type: Scene type of the scenes.
-        aliases: Mapping of model paths, or their stems, to asset names.
-        fixed_tolerance: Largest distance (m, rotation entries) of a fixed object from the scene type's pose, which it
-            then gets. ``math.inf`` accepts any pose.
-        slots: N of the scenes; None takes that of the file.
-    """
-
-    info: DatasetInfo
-    scene_type: SceneType
-    aliases: Mapping[str, str] = field(default_factory=dict)
-    fixed_tolerance: float = FIXED_TOLERANCE
-    slots: int | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_categories", self.info.categories_in(self.scene_type, self.aliases))
-
-    @property
-    def normalizer(self) -> Normalizer:
-        """The files' normalizer with features in the order of the scene type.
-
-        Assets without a path in the files, or with several, are scaled like *empty*.
-        """
-        found: Tensor = self._categories  # type: ignore[attr-defined]
-        order = torch.full((self.scene_type.num_assets + 1,), len(self.info.model_paths))
-        order[found] = torch.arange(len(found))
-        doubled = torch.bincount(found, minlength=len(order)) > 1
-        order[doubled] = len(self.info.model_paths)
-        features = torch.cat([torch.arange(POSE_FEATURES), POSE_FEATURES + order])
-        files = self.info.normalizer
-        return Normalizer(*(v[features] for v in (files.scale, files.min, files.input_min, files.input_max)))
-
-    def scenes(self, rows: Rows) -> Tensor:
-        """(M, N, D) float32 raw scenes of ``rows``: fixed objects in the first slots, exact one-hots and rotations.
-
-        Raises:
-            CorruptFileError: a value is not finite, a slot is not one-hot or has no rotation (row and slot named).
-            InvalidInputError: a fixed object is missing and no slot is empty, or stands elsewhere (row named).
-        """
-        values = torch.from_numpy(np.array(rows.scenes))  # a copy: arrow's memory is read-only
-        if not len(values):
-            slots = self.scene_type.slots if self.slots is None else self.slots
-            return torch.empty(0, slots, self.scene_type.features)
-        _require_none(~torch.isfinite(values).all(dim=-1), rows, "holds a value that is not finite")
-        raw = self.info.normalizer.unnormalize(values)
-        one_hot = raw[..., CATEGORY]
-        found = one_hot.argmax(dim=-1)
-        exact = torch.nn.functional.one_hot(found, one_hot.shape[-1])
-        _require_none((one_hot - exact).abs().amax(dim=-1) > _ONE_HOT, rows, "is not one-hot over the assets and empty")
-        categories = self._categories[found]  # type: ignore[attr-defined]
-        empty = self.scene_type.num_assets
-        rotations = self._rotations(raw[..., ROTATION].unflatten(-1, (3, 3)), categories != empty, rows)
-        batch = SceneBatch.from_parts(raw[..., :3], rotations, categories, self.scene_type)
-        if self.slots is not None:
-            batch = batch.with_slots(self.slots)
-        return place_fixed(batch, self.fixed_tolerance, rows.place, rows.start).tensor
-
-    def _rotations(self, matrices: Tensor, present: Tensor, rows: Rows) -> Tensor:
-        gram = matrices.transpose(-1, -2) @ matrices
-        error = (gram - torch.eye(3, dtype=gram.dtype)).abs().amax(dim=(-1, -2)) * present
-        flipped = present & (torch.linalg.det(matrices) < 0)
-        _require_none((error > _ROTATION) | flipped, rows, "has no rotation matrix in its features 3 to 11")
-        loose = error > 1e-5
-        if not bool(loose.any()):
-            return matrices
-        fitted = matrices.clone()
-        fitted[loose] = project_to_so3(matrices[loose].float()).to(matrices)
-        return fitted
-
-
-def place_fixed(batch: SceneBatch, tolerance: float, place: str = "the batch", start: int = 0) -> SceneBatch:
-    """The same scenes with the scene type's fixed objects in the first slots, in order and in their exact poses.
-
-    Other objects keep their order. A fixed object that a scene lacks is added where a slot is empty.
-
-    Args:
-        batch: B scenes, fixed objects in any slot.
-        tolerance: Largest distance (m, rotation entries) of fixed objects from their poses.
-        place: Source of the scenes, for messages.
-        start: Row of the first scene in the source, for messages.
-
-    Raises:
-        InvalidInputError: a fixed object stands elsewhere, or is missing from a scene without an empty slot.
-    """
-    tensor = batch.tensor.clone()
-    for slot, fixed in enumerate(batch.scene_type.fixed):
-        wanted = _fixed_row(fixed, batch.scene_type)
-        rest = tensor[:, slot:]
-        is_it = rest[..., CATEGORY].argmax(dim=-1) == int(wanted[CATEGORY].argmax())
-        distance = (rest[..., POSE] - wanted[POSE]).abs().amax(dim=-1).masked_fill(~is_it, torch.inf)
-        nearest = distance.argmin(dim=1)
-        there = is_it.any(dim=1)
-        off = there & (distance.amin(dim=1) > tolerance)
-        if bool(off.any()):
-            row = int(torch.nonzero(off)[0])
-            pose = [round(value, 4) for value in rest[row, int(nearest[row]), POSE].tolist()]
-            raise InvalidInputError(
-                f"row {start + row} of {place} has the fixed {fixed.asset!r} at {pose[:3]} m, rotation {pose[3:]}; "
-                f"scene type {batch.scene_type.name!r} has it at {list(fixed.translation)} m, rotation "
-                f"{list(fixed.rotation)}. Move the scenes, or accept and overwrite it with fixed_tolerance=math.inf"
-            )
-        is_empty = rest[..., -1] > 0.5
-        lost = ~there & ~is_empty.any(dim=1)
-        if bool(lost.any()):
-            raise InvalidInputError(
-                f"row {start + int(torch.nonzero(lost)[0])} of {place} lacks the fixed {fixed.asset!r} of "
-                f"{batch.scene_type.name!r} and has no empty slot for it; pass slots={tensor.shape[1] + 1}"
-            )
-        source = slot + torch.where(there, nearest, is_empty.int().argmax(dim=1))
-        tensor = _to_slot(tensor, source, slot)
-        tensor[:, slot] = wanted
-    return SceneBatch(tensor, batch.scene_type)
-
-
-def _to_slot(tensor: Tensor, source: Tensor, slot: int) -> Tensor:
-    """Slot ``source`` (B,) moved to ``slot``; the slots between move up by one."""
-    index = torch.arange(tensor.shape[1]).expand(tensor.shape[:2])
-    moved = (index > slot) & (index <= source[:, None])
-    index = torch.where(moved, index - 1, index)
-    index[:, slot] = source
-    return tensor.gather(1, index[..., None].expand_as(tensor))
-
-
-def _fixed_row(fixed: FixedObject, scene_type: SceneType) -> Tensor:
-    row = torch.zeros(scene_type.features)
-    row[POSE] = torch.tensor([*fixed.translation, *fixed.rotation])
-    row[POSE_FEATURES + scene_type.assets.index(fixed.asset)] = 1.0
-    return row
-
-
-def _require_none(bad: Tensor, rows: Rows, what: str) -> None:
-    """Raise CorruptFileError for the first slot marked in ``bad`` (M, N)."""
-    if bool(bad.any()):
-        row, slot = torch.nonzero(bad)[0].tolist()
-        raise CorruptFileError(f"row {rows.start + row} of {rows.place!r}, slot {slot}, {what}")
-
-
-def scene_keys(tensor: Tensor) -> NDArray[np.uint64]:
-    """(M,) keys of raw scenes (M, N, D): equal for the same objects in the same poses, in any order of slots.
-
-    Rows of a dataset that repeat a scene with another prompt share one key. The poses must be bit-equal.
-    """
-    chunks = [_chunk_keys(chunk) for chunk in tensor.split(_KEYS_AT_ONCE)]
-    return np.concatenate(chunks) if chunks else np.empty(0, dtype=np.uint64)
-
-
-def _chunk_keys(tensor: Tensor) -> NDArray[np.uint64]:
-    words = (tensor.float() + 0.0).contiguous().numpy().view(np.uint32).astype(np.uint64)  # + 0.0: no minus zero
-    hashed = np.zeros(words.shape[:2], dtype=np.uint64)
-    with np.errstate(over="ignore"):
-        for feature in range(words.shape[-1]):
-            hashed = mix_bits(hashed ^ words[..., feature])
-        hashed[(tensor[..., -1] > 0.5).numpy()] = 0
-        return mix_bits(hashed.sum(axis=1, dtype=np.uint64))
-
-
-def mix_bits(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Scatter 64-bit values evenly (the finaliser of SplitMix64, Steele et al. 2014)."""
-    values = values + np.uint64(0x9E3779B97F4A7C15)
-    values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return values ^ (values >> np.uint64(31))
-
-
-Keys = NDArray[np.uint64]
-
-
-@dataclass(frozen=True)
-class Part:
-    """One of several disjoint parts of a dataset, decided scene by scene from the scene's key.
-
-    A scene stays in its part when the dataset grows or is read in another order. Rows that repeat a scene share its
-    part. The fractions are therefore only met on average.
-
-    Attributes:
-        fractions: Fractions of all parts, in order; they may sum to less than one.
-        index: Index of this part.
-        seed: Seed of the assignment, not negative.
-
-    Raises:
-        InvalidInputError: fractions, index or seed are not as described above.
-
-    >>> keys = mix_bits(np.arange(10_000, dtype=np.uint64))
-    >>> train, test = (Part((0.9, 0.1), index).contains(keys) for index in (0, 1))
-    >>> int((train & test).sum()), int((train | test).sum()), abs(int(test.sum()) - 1000) < 150
-    (0, 10000, True)
-    """
-
-    fractions: tuple[float, ...]
-    index: int
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "fractions", check_fractions(self.fractions))
-        if not 0 <= self.index < len(self.fractions):
-            raise InvalidInputError(
-                f"there is no part {self.index} of {len(self.fractions)} parts; index goes from 0 to "
-                f"{len(self.fractions) - 1}"
-            )
-        if self.seed < 0:
-            raise InvalidInputError(f"a part needs seed >= 0, got {self.seed}")
-
-    def contains(self, keys: Keys) -> NDArray[np.bool_]:
-        """(M,) bool, True for scenes, given by their keys, that are in this part."""
-        draws = mix_bits(keys ^ mix_bits(np.array([self.seed], dtype=np.uint64))) / 2.0**64  # (M,) in [0, 1]
-        bounds = list(accumulate(self.fractions, initial=0.0))
-        low, high = bounds[self.index], bounds[self.index + 1]
-        return (draws >= low) & ((draws < high) | (high >= 1 - 1e-9))
-
-
-def check_fractions(fractions: Sequence[float]) -> tuple[float, ...]:
-    """The fractions; raises InvalidInputError when one is negative or they sum to more than one."""
-    if not len(fractions) or any(fraction < 0 for fraction in fractions) or sum(fractions) > 1 + 1e-9:
-        raise InvalidInputError(f"fractions must be >= 0 and sum to at most 1, got {list(fractions)}")
-    return tuple(float(fraction) for fraction in fractions)
-
-
-def split_rows(keys: Keys, fractions: Sequence[float], seed: int) -> list[NDArray[np.int64]]:
-    """Rows of disjoint random parts; sizes are exact where no scene repeats, rows of one scene stay together."""
-    check_fractions(fractions)
-    if seed < 0:
-        raise InvalidInputError(f"a split needs seed >= 0, got {seed}")
-    _, first, group, sizes = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
-    shuffled = np.argsort(first)[np.random.default_rng(seed).permutation(len(sizes))]  # groups, in random order
-    ends = np.cumsum(sizes[shuffled])
-    position = np.empty(len(sizes), dtype=np.int64)  # position of a group's last row in the shuffled order
-    position[shuffled] = ends
-    order = np.argsort(position[group], kind="stable")
-    edges = [round(bound * len(keys)) for bound in accumulate(fractions, initial=0.0)]
-    whole = [int(ends[np.searchsorted(ends, edge)]) if edge > 0 else 0 for edge in edges]
-    return [order[low:high] for low, high in pairwise(whole)]
-
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,11 +122,11 @@ class SceneDataset:
         """
         files = find_files(path)
         layout = make_layout(metadata or find_metadata(path), scene_type, aliases, fixed_tolerance, slots)
-        blocks = (block for file in files for block in list_blocks(file))
-        dataset = cls._collect((read_block(block, layout.info.features) for block in blocks), layout, limit)
+        blocks = (rows for file in files for rows in read_rows(file, layout.info.features))
+        dataset = cls._collect(blocks, layout, limit)
         own = metadata is None and (Path(path) / METADATA).is_file()
         if own and not dataset.complete and (limit is None or len(dataset) < limit):
-            logger.warning(
+            _LOGGER.warning(
                 "%r holds %d of the %d requested scenes: shards are missing, or are still being generated; "
                 "run the same scene-envs generate command again to make the rest",
                 str(path),
@@ -433,7 +195,7 @@ class SceneDataset:
         return len(self) >= int(self.metadata.get("count") or 0)
 
     @property
-    def keys(self) -> NDArray[np.uint64]:
+    def keys(self) -> Keys:
         """(M,) keys, equal for rows of the same scene; see :func:`~scene_envs.datasets.dataset.scene_keys`."""
         return scene_keys(self.tensor)
 
@@ -459,7 +221,18 @@ class SceneDataset:
         Raises:
             InvalidInputError: a fraction is negative, or they sum to more than one.
         """
-        return tuple(self[torch.from_numpy(rows)] for rows in split_rows(self.keys, fractions, seed))
+        check_fractions(fractions)
+        if seed < 0:
+            raise InvalidInputError(f"a split needs seed >= 0, got {seed}")
+        _, first, group, sizes = np.unique(self.keys, return_index=True, return_inverse=True, return_counts=True)
+        shuffled = np.argsort(first)[np.random.default_rng(seed).permutation(len(sizes))]  # groups, in random order
+        ends = np.cumsum(sizes[shuffled])
+        position = np.empty(len(sizes), dtype=np.int64)  # position of a group's last row in the shuffled order
+        position[shuffled] = ends
+        order = np.argsort(position[group], kind="stable")
+        edges = [round(bound * len(self)) for bound in accumulate(fractions, initial=0.0)]
+        whole = [int(ends[np.searchsorted(ends, edge)]) if edge > 0 else 0 for edge in edges]
+        return tuple(self[torch.from_numpy(order[low:high])] for low, high in pairwise(whole))
 
     def stable_split(self, fractions: Sequence[float], seed: int = 0) -> tuple[SceneDataset, ...]:
         """Disjoint parts decided scene by scene, so that a scene keeps its part when the dataset grows.
@@ -494,25 +267,30 @@ class SceneDataset:
         return folder
 
 
-def make_layout(
-    metadata: str | os.PathLike[str],
-    scene_type: str | SceneType | None,
-    aliases: Mapping[str, str] | None,
-    fixed_tolerance: float,
-    slots: int | None,
-) -> Layout:
-    """Layout of files with this ``metadata.json``; arguments and errors as for :meth:`SceneDataset.load`."""
-    info: DatasetInfo = read_metadata(metadata)
-    name = scene_type if scene_type is not None else info.scene_type
-    if name is None:
-        raise InvalidInputError(f"{str(info.path)!r} names no scene type; pass scene_type=")
-    try:
-        known = get_scene_type(name)
-    except (InvalidInputError, UnknownNameError) as error:
-        if scene_type is not None:
-            raise
-        raise type(error)(f"{str(info.path)!r}: {error} Register it, or pass scene_type=") from error
-    return Layout(info, known, aliases or {}, fixed_tolerance, slots)
+def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
+    """Scenes from a scene file, a folder of them, a run's folder with a scene file, a dataset or a file of a dataset.
+
+    Args:
+        path: File or folder.
+        count: Largest number of scenes, the first ones; None for all. Files are read in order of name.
+
+    Raises:
+        InvalidInputError: ``count`` is below 1, ``path`` does not exist, or its files are of several scene types.
+    """
+    if count is not None and count < 1:
+        raise InvalidInputError(f"count must be at least 1, or null for all, got {count}")
+    path = find_scenes(path)
+    if is_dataset(path):
+        return SceneDataset.load(path, limit=count).batch()
+    files = scene_files(path) if path.is_dir() else [path]
+    batches = [SceneBatch.load(file) for file in files]
+    names = sorted({batch.scene_type.name for batch in batches})
+    if len(names) > 1:
+        raise InvalidInputError(
+            f"the scene files of {str(path)!r} are of several scene types, {', '.join(names)}; name one of the files"
+        )
+    slots = max(batch.tensor.shape[1] for batch in batches)
+    return SceneBatch.concatenate([batch.with_slots(slots) for batch in batches])[:count]
 
 
 def to_union(batch: SceneBatch, union: SceneType) -> SceneBatch:
@@ -550,27 +328,238 @@ def union_normalizer(normalizers: Sequence[Normalizer], union: SceneType) -> Nor
     return Normalizer.from_range(low, high)
 
 
-def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
-    """Scenes from a scene file, a folder of them, a run's folder with a scene file, a dataset or a file of a dataset.
+def make_layout(
+    metadata: str | os.PathLike[str],
+    scene_type: str | SceneType | None,
+    aliases: Mapping[str, str] | None,
+    fixed_tolerance: float,
+    slots: int | None,
+) -> Layout:
+    """Layout of files with this ``metadata.json``; arguments and errors as for :meth:`SceneDataset.load`."""
+    info: DatasetInfo = read_metadata(metadata)
+    name = scene_type if scene_type is not None else info.scene_type
+    if name is None:
+        raise InvalidInputError(f"{str(info.path)!r} names no scene type; pass scene_type=")
+    try:
+        known = get_scene_type(name)
+    except (InvalidInputError, UnknownNameError) as error:
+        if scene_type is not None:
+            raise
+        raise type(error)(f"{str(info.path)!r}: {error} Register it, or pass scene_type=") from error
+    return Layout(info, known, aliases or {}, fixed_tolerance, slots)
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Conversion of the files of one dataset to scenes of a scene type.
+
+    Attributes:
+        info: Metadata of the files.
+        scene_type: Scene type of the scenes.
+        aliases: Mapping of model paths, or their stems, to asset names.
+        fixed_tolerance: Largest distance (m, rotation entries) of a fixed object from the scene type's pose, which it
+            then gets. ``math.inf`` accepts any pose.
+        slots: N of the scenes; None takes that of the file.
+    """
+
+    info: DatasetInfo
+    scene_type: SceneType
+    aliases: Mapping[str, str] = field(default_factory=dict)
+    fixed_tolerance: float = FIXED_TOLERANCE
+    slots: int | None = None
+
+    @cached_property
+    def _categories(self) -> Tensor:
+        return self.info.categories_in(self.scene_type, self.aliases)
+
+    @property
+    def normalizer(self) -> Normalizer:
+        """The files' normalizer with features in the order of the scene type.
+
+        Assets without a path in the files, or with several, are scaled like *empty*.
+        """
+        found = self._categories
+        order = torch.full((self.scene_type.num_assets + 1,), len(self.info.model_paths))
+        order[found] = torch.arange(len(found))
+        doubled = torch.bincount(found, minlength=len(order)) > 1
+        order[doubled] = len(self.info.model_paths)
+        features = torch.cat([torch.arange(POSE_FEATURES), POSE_FEATURES + order])
+        files = self.info.normalizer
+        return Normalizer(*(v[features] for v in (files.scale, files.min, files.input_min, files.input_max)))
+
+    def scenes(self, rows: Rows) -> Tensor:
+        """(M, N, D) float32 raw scenes of ``rows``: fixed objects in the first slots, exact one-hots and rotations.
+
+        Raises:
+            CorruptFileError: a value is not finite, a slot is not one-hot or has no rotation (row and slot named).
+            InvalidInputError: a fixed object is missing and no slot is empty, or stands elsewhere (row named).
+        """
+        values = torch.from_numpy(np.array(rows.scenes))  # a copy: arrow's memory is read-only
+        if not len(values):
+            slots = self.scene_type.slots if self.slots is None else self.slots
+            return torch.empty(0, slots, self.scene_type.features)
+        _require_none(~torch.isfinite(values).all(dim=-1), rows, "holds a value that is not finite")
+        raw = self.info.normalizer.unnormalize(values)
+        one_hot = raw[..., CATEGORY]
+        found = one_hot.argmax(dim=-1)
+        exact = torch.nn.functional.one_hot(found, one_hot.shape[-1])
+        _require_none((one_hot - exact).abs().amax(dim=-1) > _ONE_HOT, rows, "is not one-hot over the assets and empty")
+        categories = self._categories[found]
+        empty = self.scene_type.num_assets
+        rotations = self._rotations(raw[..., ROTATION].unflatten(-1, (3, 3)), categories != empty, rows)
+        batch = SceneBatch.from_parts(raw[..., :3], rotations, categories, self.scene_type)
+        if self.slots is not None:
+            batch = batch.with_slots(self.slots)
+        return place_fixed(batch, self.fixed_tolerance, rows.place, rows.start).tensor
+
+    def _rotations(self, matrices: Tensor, present: Tensor, rows: Rows) -> Tensor:
+        gram = matrices.transpose(-1, -2) @ matrices
+        error = (gram - torch.eye(3, dtype=gram.dtype)).abs().amax(dim=(-1, -2)) * present
+        flipped = present & (torch.linalg.det(matrices) < 0)
+        _require_none((error > _ROTATION) | flipped, rows, "has no rotation matrix in its features 3 to 11")
+        loose = error > 1e-5
+        if not bool(loose.any()):
+            return matrices
+        fitted = matrices.clone()
+        fitted[loose] = project_to_so3(matrices[loose].float()).to(matrices)
+        return fitted
+
+
+def place_fixed(batch: SceneBatch, tolerance: float, place: str = "the batch", start: int = 0) -> SceneBatch:
+    """The same scenes with the scene type's fixed objects in the first slots, in order and in their exact poses.
+
+    Other objects keep their order. A fixed object that a scene lacks is added where a slot is empty.
 
     Args:
-        path: File or folder.
-        count: Largest number of scenes, the first ones; None for all. Files are read in order of name.
+        batch: B scenes, fixed objects in any slot.
+        tolerance: Largest distance (m, rotation entries) of fixed objects from their poses.
+        place: Source of the scenes, for messages.
+        start: Row of the first scene in the source, for messages.
 
     Raises:
-        InvalidInputError: ``count`` is below 1, ``path`` does not exist, or its files are of several scene types.
+        InvalidInputError: a fixed object stands elsewhere, or is missing from a scene without an empty slot.
     """
-    if count is not None and count < 1:
-        raise InvalidInputError(f"count must be at least 1, or null for all, got {count}")
-    path = find_scenes(path)
-    if is_dataset(path):
-        return SceneDataset.load(path, limit=count).batch()
-    files = scene_files(path) if path.is_dir() else [path]
-    batches = [SceneBatch.load(file) for file in files]
-    names = sorted({batch.scene_type.name for batch in batches})
-    if len(names) > 1:
-        raise InvalidInputError(
-            f"the scene files of {str(path)!r} are of several scene types, {', '.join(names)}; name one of the files"
-        )
-    slots = max(batch.tensor.shape[1] for batch in batches)
-    return SceneBatch.concatenate([batch.with_slots(slots) for batch in batches])[:count]
+    tensor = batch.tensor.clone()
+    for slot, fixed in enumerate(batch.scene_type.fixed):
+        category = batch.scene_type.assets.index(fixed.asset)
+        wanted = torch.zeros(batch.scene_type.features)
+        wanted[POSE] = torch.tensor([*fixed.translation, *fixed.rotation])
+        wanted[POSE_FEATURES + category] = 1.0
+        rest = tensor[:, slot:]
+        is_it = rest[..., CATEGORY].argmax(dim=-1) == category
+        distance = (rest[..., POSE] - wanted[POSE]).abs().amax(dim=-1).masked_fill(~is_it, torch.inf)
+        nearest = distance.argmin(dim=1)
+        there = is_it.any(dim=1)
+        off = there & (distance.amin(dim=1) > tolerance)
+        if bool(off.any()):
+            row = int(torch.nonzero(off)[0])
+            pose = [round(value, 4) for value in rest[row, int(nearest[row]), POSE].tolist()]
+            raise InvalidInputError(
+                f"row {start + row} of {place} has the fixed {fixed.asset!r} at {pose[:3]} m, rotation {pose[3:]}; "
+                f"scene type {batch.scene_type.name!r} has it at {list(fixed.translation)} m, rotation "
+                f"{list(fixed.rotation)}. Move the scenes, or accept and overwrite it with fixed_tolerance=math.inf"
+            )
+        is_empty = rest[..., -1] > 0.5
+        lost = ~there & ~is_empty.any(dim=1)
+        if bool(lost.any()):
+            raise InvalidInputError(
+                f"row {start + int(torch.nonzero(lost)[0])} of {place} lacks the fixed {fixed.asset!r} of "
+                f"{batch.scene_type.name!r} and has no empty slot for it; pass slots={tensor.shape[1] + 1}"
+            )
+        source = slot + torch.where(there, nearest, is_empty.int().argmax(dim=1))
+        tensor = _to_slot(tensor, source, slot)
+        tensor[:, slot] = wanted
+    return SceneBatch(tensor, batch.scene_type)
+
+
+def _to_slot(tensor: Tensor, source: Tensor, slot: int) -> Tensor:
+    """Slot ``source`` (B,) moved to ``slot``; the slots between move up by one."""
+    index = torch.arange(tensor.shape[1]).expand(tensor.shape[:2])
+    moved = (index > slot) & (index <= source[:, None])
+    index = torch.where(moved, index - 1, index)
+    index[:, slot] = source
+    return tensor.gather(1, index[..., None].expand_as(tensor))
+
+
+def _require_none(bad: Tensor, rows: Rows, what: str) -> None:
+    """Raise CorruptFileError for the first slot marked in ``bad`` (M, N)."""
+    if bool(bad.any()):
+        row, slot = torch.nonzero(bad)[0].tolist()
+        raise CorruptFileError(f"row {rows.start + row} of {rows.place!r}, slot {slot}, {what}")
+
+
+def scene_keys(tensor: Tensor) -> Keys:
+    """(M,) keys of raw scenes (M, N, D): equal for the same objects in the same poses, in any order of slots.
+
+    Rows of a dataset that repeat a scene with another prompt share one key. The poses must be bit-equal.
+    """
+    chunks = [_chunk_keys(chunk) for chunk in tensor.split(_KEYS_AT_ONCE)]
+    return np.concatenate(chunks) if chunks else np.empty(0, dtype=np.uint64)
+
+
+def _chunk_keys(tensor: Tensor) -> Keys:
+    words = (tensor.float() + 0.0).contiguous().numpy().view(np.uint32).astype(np.uint64)  # + 0.0: no minus zero
+    hashed = np.zeros(words.shape[:2], dtype=np.uint64)
+    with np.errstate(over="ignore"):
+        for feature in range(words.shape[-1]):
+            hashed = mix_bits(hashed ^ words[..., feature])
+        hashed[(tensor[..., -1] > 0.5).numpy()] = 0
+        return mix_bits(hashed.sum(axis=1, dtype=np.uint64))
+
+
+def mix_bits(values: Keys) -> Keys:
+    """Scatter 64-bit values evenly (the finaliser of SplitMix64, Steele et al. 2014)."""
+    values = values + np.uint64(0x9E3779B97F4A7C15)
+    values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return values ^ (values >> np.uint64(31))
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of several disjoint parts of a dataset, decided scene by scene from the scene's key.
+
+    A scene stays in its part when the dataset grows or is read in another order. Rows that repeat a scene share its
+    part. The fractions are therefore only met on average.
+
+    Attributes:
+        fractions: Fractions of all parts, in order; they may sum to less than one.
+        index: Index of this part.
+        seed: Seed of the assignment, not negative.
+
+    Raises:
+        InvalidInputError: fractions, index or seed are not as described above.
+
+    >>> keys = mix_bits(np.arange(10_000, dtype=np.uint64))
+    >>> train, test = (Part((0.9, 0.1), index).contains(keys) for index in (0, 1))
+    >>> int((train & test).sum()), int((train | test).sum()), abs(int(test.sum()) - 1000) < 150
+    (0, 10000, True)
+    """
+
+    fractions: tuple[float, ...]
+    index: int
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "fractions", check_fractions(self.fractions))
+        if not 0 <= self.index < len(self.fractions):
+            raise InvalidInputError(
+                f"there is no part {self.index} of {len(self.fractions)} parts; index goes from 0 to "
+                f"{len(self.fractions) - 1}"
+            )
+        if self.seed < 0:
+            raise InvalidInputError(f"a part needs seed >= 0, got {self.seed}")
+
+    def contains(self, keys: Keys) -> NDArray[np.bool_]:
+        """(M,) bool, True for scenes, given by their keys, that are in this part."""
+        draws = mix_bits(keys ^ mix_bits(np.array([self.seed], dtype=np.uint64))) / 2.0**64  # (M,) in [0, 1]
+        bounds = list(accumulate(self.fractions, initial=0.0))
+        low, high = bounds[self.index], bounds[self.index + 1]
+        return (draws >= low) & ((draws < high) | (high >= 1 - 1e-9))
+
+
+def check_fractions(fractions: Sequence[float]) -> tuple[float, ...]:
+    """The fractions; raises InvalidInputError when one is negative or they sum to more than one."""
+    if not len(fractions) or any(fraction < 0 for fraction in fractions) or sum(fractions) > 1 + 1e-9:
+        raise InvalidInputError(f"fractions must be >= 0 and sum to at most 1, got {list(fractions)}")
+    return tuple(float(fraction) for fraction in fractions)

@@ -1,4 +1,4 @@
-"""Dataset file reader: parquet and arrow, whole or block by block, in any list layout."""
+"""Files of datasets: shards and metadata as they are written, and parquet and arrow files in any list layout."""
 
 from __future__ import annotations
 
@@ -31,6 +31,10 @@ _NOTES = b"scene_envs"
 _MODEL_PATH = "scene_envs/assets/{name}"
 _ROW_GROUP = 500
 """Scenes per row group, the unit that a streaming reader holds in memory."""
+_BLOCK = 2000
+"""Largest number of scenes that are read at a time."""
+_STATE, _SPLITS = "state.json", "dataset_dict.json"
+_SUFFIXES = (".parquet", ".arrow")
 
 
 def shard_name(index: int) -> str:
@@ -138,23 +142,6 @@ def open_parquet(path: Path) -> pq.ParquetFile:
         ) from error
 
 
-_STATE, _SPLITS = "state.json", "dataset_dict.json"
-_SUFFIXES = (".parquet", ".arrow")
-BLOCK = 2000
-"""Scenes per block at most."""
-
-
-@dataclass(frozen=True)
-class Block:
-    """A run of rows of one file: the unit that is read at a time."""
-
-    file: Path  # parquet or arrow file
-    start: int  # first row of the block
-    rows: int  # number of rows
-    group: int = -1  # row group of a parquet file that holds the block; -1 for arrow
-    skip: int = 0  # number of rows of the group before the block
-
-
 @dataclass(frozen=True, eq=False)
 class Rows:
     """Rows of a file, unchanged."""
@@ -204,40 +191,31 @@ def find_metadata(path: str | os.PathLike[str]) -> Path:
     return above if above.is_file() and not (folder / METADATA).is_file() else folder / METADATA
 
 
-def list_blocks(file: Path) -> list[Block]:
-    """The blocks of one file, found without reading its scenes; raises CorruptFileError."""
-    if file.suffix == ".arrow":
-        return _cut(file, _arrow_table(file).num_rows)
-    metadata = open_parquet(file).metadata
-    blocks: list[Block] = []
-    start = 0
-    for group in range(metadata.num_row_groups):
-        rows = metadata.row_group(group).num_rows
-        blocks += _cut(file, rows, start, group)
-        start += rows
-    return blocks
-
-
-def read_block(block: Block, features: int) -> Rows:
-    """The rows of a block whose slots have ``features`` features (D) in the file.
+def read_rows(file: Path, features: int) -> Iterator[Rows]:
+    """The rows of one file, whose slots have ``features`` features (D) in the file, a block at a time.
 
     Raises:
         CorruptFileError: it cannot be read, columns are missing, or scenes have another width or gaps.
     """
-    try:
-        if block.file.suffix == ".arrow":
-            table = _arrow_table(block.file)
-            present = _columns(table.column_names, str(block.file))
-            return to_rows(table.slice(block.start, block.rows).select(present), features, str(block.file), block.start)
-        parquet = open_parquet(block.file)
-        present = _columns(parquet.schema_arrow.names, str(block.file))
-        table = _within_group(parquet.iter_batches(BLOCK, row_groups=[block.group], columns=present), block)
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise CorruptFileError(
-            f"cannot read rows {block.start} to {block.start + block.rows - 1} of {str(block.file)!r}: {error}; "
-            "delete the file and generate again to remake it"
-        ) from error
-    return to_rows(table, features, str(block.file), block.start)
+    place, start = str(file), 0
+    if file.suffix == ".arrow":
+        table = _arrow_table(file)
+        batches = iter(table.select(_columns(table.column_names, place)).to_batches(_BLOCK))
+    else:
+        parquet = open_parquet(file)
+        batches = parquet.iter_batches(_BLOCK, columns=_columns(parquet.schema_arrow.names, place))
+    while True:
+        try:
+            batch = next(batches, None)
+        except (pa.ArrowException, OSError, ValueError) as error:
+            raise CorruptFileError(
+                f"cannot read {place!r} from row {start} on: {error}; delete the file and generate again to remake it"
+            ) from error
+        if batch is None:
+            return
+        if batch.num_rows:
+            yield to_rows(pa.Table.from_batches([batch]), features, place, start)
+            start += batch.num_rows
 
 
 def to_rows(table: pa.Table, features: int, place: str, start: int = 0) -> Rows:
@@ -288,26 +266,6 @@ def _arrow_table(file: Path) -> pa.Table:
         raise CorruptFileError(f"{str(file)!r} is not a readable arrow file ({error}); fetch it again") from error
 
 
-def _cut(file: Path, rows: int, start: int = 0, group: int = -1) -> list[Block]:
-    return [
-        Block(file, start + skip, min(BLOCK, rows - skip), group, skip if group >= 0 else 0)
-        for skip in range(0, rows, BLOCK)
-    ]
-
-
-def _within_group(batches: Iterator[pa.RecordBatch], block: Block) -> pa.Table:
-    """The block's rows from the batches of its row group."""
-    parts, seen = [], 0
-    for batch in batches:
-        low, high = max(block.skip - seen, 0), min(block.skip + block.rows - seen, batch.num_rows)
-        if low < high:
-            parts.append(batch.slice(low, high - low))
-        seen += batch.num_rows
-        if seen >= block.skip + block.rows:
-            break
-    return pa.Table.from_batches(parts)
-
-
 def _columns(names: Sequence[str], place: str) -> list[str]:
     """Names of the columns that are read from a file with the columns ``names``."""
     missing = [name for name in (SCENES, PROMPTS) if name not in names]
@@ -343,7 +301,7 @@ def _to_array(column: pa.Array, features: int, start: int) -> NDArray[np.floatin
     _check_complete(column, start, "scene")
     sizes = np.asarray(pc.list_value_length(column))
     inner = pc.list_flatten(column)
-    if pa.types.is_list(inner.type) or pa.types.is_large_list(inner.type) or pa.types.is_fixed_size_list(inner.type):
+    if _is_list(inner):
         _check_complete(inner, start, "slot", int(sizes.max(initial=1)))
         widths = np.asarray(pc.list_value_length(inner))
         inner = pc.list_flatten(inner)
@@ -364,10 +322,13 @@ def _to_array(column: pa.Array, features: int, start: int) -> NDArray[np.floatin
     return values.reshape(count, int(sizes[0]), features)
 
 
+def _is_list(column: pa.Array) -> bool:
+    kinds = pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list
+    return any(is_kind(column.type) for is_kind in kinds)
+
+
 def _check_complete(lists: pa.Array, start: int, what: str, per_row: int = 1) -> None:
-    if not (
-        pa.types.is_list(lists.type) or pa.types.is_large_list(lists.type) or pa.types.is_fixed_size_list(lists.type)
-    ):
+    if not _is_list(lists):
         raise ValueError(f"column {SCENES!r} holds {lists.type}, expected lists of floats")
     if lists.null_count:
         row = start + int(np.flatnonzero(np.asarray(lists.is_null()))[0]) // per_row
@@ -461,7 +422,8 @@ def _parse(file: Path, metadata: dict[str, Any]) -> DatasetInfo:
     paths = tuple(map(str, metadata["model_paths"] or ()))
     try:
         normalizer = Normalizer.from_state(metadata["normalizer_state"])
-        slots, count = (_whole(metadata, key) for key in ("max_num_objects_per_scene", "count"))
+        numbers = [metadata.get(key) for key in ("max_num_objects_per_scene", "count")]
+        slots, count = (None if number is None else int(number) for number in numbers)
     except (InvalidInputError, TypeError, ValueError) as error:
         raise CorruptFileError(f"{str(file)!r}: {error}") from error
     for key, wanted in (("translation_vec_len", 3), ("model_path_vec_len", len(paths) + 1)):
@@ -478,11 +440,6 @@ def _parse(file: Path, metadata: dict[str, Any]) -> DatasetInfo:
         count=count,
         metadata=metadata,
     )
-
-
-def _whole(metadata: dict[str, Any], key: str) -> int | None:
-    value = metadata.get(key)
-    return None if value is None else int(value)
 
 
 def _whole_slot(normalizer: Normalizer, one_hot: int, file: Path) -> Normalizer:

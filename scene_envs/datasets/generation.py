@@ -13,7 +13,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -179,10 +179,8 @@ def _make(
         return
     is_ray = backend == "ray"
     factory, scene_type = grammar_factory(name), get_scene_type(grammar.scene_type)
-    plain = SceneType(
-        **{field.name: getattr(scene_type, field.name) for field in fields(scene_type)}
-    )  # no built assets
-    inputs = _pickled(factory, (factory, plain, normalizer.state()), is_ray)
+    made = factory, replace(scene_type), normalizer.state()  # a copy of the scene type, without built assets
+    inputs = _pickled(factory, made, is_ray)
 
     def done(task: Task, shard: Any) -> None:
         if isinstance(shard, WorkerFailure):

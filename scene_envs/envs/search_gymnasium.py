@@ -29,47 +29,8 @@ if TYPE_CHECKING:
     from scene_envs.render import LiveViewer
 
 
-class SearchRendering:
-    """Rendering of the search environments.
-
-    Args:
-        mode: ``"rgb_array"`` for pictures with masked objects in red; ``"human"`` for a page in the browser that shows
-            each state as another scene; None for no rendering.
-    """
-
-    MODES = ("human", "rgb_array")
-
-    def __init__(self, mode: str | None) -> None:
-        self.mode = check_render_mode(mode, self.MODES)
-        self._viewer: LiveViewer | None = None
-
-    def picture(self, scene: SceneBatch, state: SearchState) -> np.ndarray | None:
-        """(H, W, 3) uint8 picture with mode ``"rgb_array"``; None otherwise."""
-        if self.mode != "rgb_array":
-            return None
-        return picture(scene, highlight=state.mask.unsqueeze(0))[0]
-
-    def show(self, scene: SceneBatch, state: SearchState) -> None:
-        """Add a state to the page with mode ``"human"``."""
-        if self.mode != "human":
-            return
-        if self._viewer is None:
-            from scene_envs.render import LiveViewer
-
-            self._viewer = LiveViewer(f"search of {scene.scene_type.name.replace('_', ' ')}")
-        masked = int((state.mask & ~scene.is_empty[0]).sum())
-        empty = int(state.mask.sum()) - masked
-        value = f"depth {state.depth}: objective {state.objective:.4g}"
-        self._viewer.show(scene, f"{value}, {masked} objects and {empty} empty slots masked")
-
-    def close(self) -> None:
-        """Close the viewer; its page remains."""
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
-
-
 Observation = dict[str, np.ndarray]
+_RENDER_MODES = ("human", "rgb_array")
 
 
 class SearchEnv(SpecMixin, gym.Env[Any, Any]):
@@ -161,7 +122,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     * v0: initial version.
     """
 
-    metadata = {"render_modes": list(SearchRendering.MODES), "render_fps": 2}  # noqa: RUF012  (declared so by gym.Env)
+    metadata = {"render_modes": list(_RENDER_MODES), "render_fps": 2}  # noqa: RUF012  (declared so by gym.Env)
 
     @takes(SearchSettings)
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
@@ -170,8 +131,8 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     def _begin(self, problem: SearchProblem, render_mode: str | None, regenerate: spaces.MultiBinary) -> None:
         """Set up an environment over ``problem``; ``regenerate`` is the space of the observed masks."""
-        self.render_mode = render_mode
-        self._rendering = SearchRendering(render_mode)
+        self.render_mode = check_render_mode(render_mode, _RENDER_MODES)
+        self._viewer: LiveViewer | None = None  # the page of "human", made at the first reset
         self.problem = problem
         self.observation_space = spaces.Dict(
             {
@@ -212,7 +173,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
             self._state = self.problem.root(tree_seed, options.get("scene"))
         self._best = self._state
         self._begun = False
-        self._rendering.show(self.scene(), self._state)
+        self._show(self._state)
         return self._observe(self._state)
 
     def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -232,7 +193,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
             raise ResetNeededError(f"the episode ended, {why}; call reset() first")
         self._begun = True
         self._state = self._child(parent, action)
-        self._rendering.show(self.scene(), self._state)
+        self._show(self._state)
         observation, info = self._observe(self._state)
         terminated = self.problem.is_solved(self._state)
         truncated = not terminated and bool(self._end(self._state))
@@ -254,12 +215,30 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """(H, W, 3) uint8 picture of the current scene, masked objects in red; None with ``"human"`` or no mode."""
-        return self._rendering.picture(self.scene(), self.state)
+        if self.render_mode != "rgb_array":
+            return None
+        return picture(self.scene(), highlight=self.state.mask.unsqueeze(0))[0]
+
+    def _show(self, state: SearchState) -> None:
+        """Add a state to the page in the browser with mode ``"human"``."""
+        if self.render_mode != "human":
+            return
+        scene = self.scene(state)
+        if self._viewer is None:
+            from scene_envs.render import LiveViewer
+
+            self._viewer = LiveViewer(f"search of {scene.scene_type.name.replace('_', ' ')}")
+        masked = int((state.mask & ~scene.is_empty[0]).sum())
+        value = f"depth {state.depth}: objective {state.objective:.4g}"
+        empty = int(state.mask.sum()) - masked
+        self._viewer.show(scene, f"{value}, {masked} objects and {empty} empty slots masked")
 
     def close(self) -> None:
         """Stop physics workers, if any, and close the viewer; its page remains."""
         self.problem.close()
-        self._rendering.close()
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
 
     @property
     def state(self) -> SearchState:

@@ -1,4 +1,4 @@
-"""Parts of breakfast tables: place settings, shared food, a crock of cutlery.
+"""Breakfast tables for six and for two: place settings, shared food, a crock of cutlery.
 
 Probabilities follow the scene grammar of the paper's dataset (Pfaff et al., CoRL 2025).
 """
@@ -27,6 +27,7 @@ from scene_envs.scene_types import get_scene_type
 
 HALF_DEPTH, HALF_LENGTH = 0.2575, 0.65
 """Largest distances (m) in x and y of object frames from the middle of the table."""
+ANYWHERE = Uniform(HALF_DEPTH, HALF_LENGTH)
 TABLE = Region(HALF_DEPTH, HALF_LENGTH, overhang=0.09)
 """Nothing hangs over the edge of the table, which is 0.375 and 0.75 m from its middle."""
 
@@ -93,34 +94,30 @@ def facing_pair(setting: Node) -> Node:
     )
 
 
-def anywhere() -> PositionDistribution:
-    return Uniform(HALF_DEPTH, HALF_LENGTH)
-
-
 def shared_plates(p: float, most: int, another_toast: float) -> Node:
     """Plates for all, each with toast or fruit."""
     food = OneOf((0.5, toast(another_toast)), (0.25, Object("apple_gala")), (0.25, Object("pear_bosc")))
-    return Repeat(Object("shared_plate", anywhere(), on=middle(food)), Geometric(p, 0, most))
+    return Repeat(Object("shared_plate", ANYWHERE, on=middle(food)), Geometric(p, 0, most))
 
 
 def shared_bowls(p: float, most: int) -> Node:
     """Bowls for all, each with bread or fruit."""
-    return Repeat(bowl_of_food(anywhere(), Yaw(), 0.2, 0.4, 0.4), Geometric(p, 0, most))
+    return Repeat(bowl_of_food(ANYWHERE, Yaw(), 0.2, 0.4, 0.4), Geometric(p, 0, most))
 
 
 def cereal(p: float) -> Node:
-    return Repeat(Object("cereal_box", anywhere()), Geometric(p, 0, 3))
+    return Repeat(Object("cereal_box", ANYWHERE), Geometric(p, 0, 3))
 
 
 def jugs(p: float) -> Node:
-    return Repeat(Object("water_jug", anywhere()), Geometric(p, 0, 2))
+    return Repeat(Object("water_jug", ANYWHERE), Geometric(p, 0, 2))
 
 
 def crock(present: float) -> Node:
     """A crock in which up to ten forks, knives and spoons stand."""
     utensil = OneOf(*((1.0, Object(name)) for name in ("fork", "knife", "dinner_spoon", "teaspoon")))
     cutlery = Standing(Repeat(utensil, Geometric(0.1, 0, 10)), CROCK_RADIUS)
-    return maybe(present, Object("utensil_crock", anywhere(), inside=cutlery))
+    return maybe(present, Object("utensil_crock", ANYWHERE, inside=cutlery))
 
 
 def six_places(plate: float, bowl: float, nothing: float) -> Node:
@@ -130,19 +127,17 @@ def six_places(plate: float, bowl: float, nothing: float) -> Node:
     return Group(*(Cluster(pair, where) for where in ends_and_middle))
 
 
-def shared_for_six(fullness: float) -> Node:
+def food_for_six(fullness: float) -> Node:
     return Group(shared_plates(1 - fullness, 4, 0.25), shared_bowls(1 - fullness, 6), cereal(0.4), jugs(0.6))
-
-
-USUAL_FOR_SIX = Group(six_places(0.535, 0.19, 0.275), shared_for_six(0.3))
-QUIET_FOR_SIX = Group(six_places(0.10, 0.05, 0.85), shared_for_six(0.3))
-FEAST_FOR_SIX = Group(six_places(0.95, 0.05, 0.00), shared_for_six(0.7))
 
 
 @register_grammar("breakfast_table_high_clutter")
 def breakfast_table_high_clutter() -> Grammar:
-    """The whole table."""
-    table = Surface([OneOf((0.90, USUAL_FOR_SIX), (0.03, QUIET_FOR_SIX), (0.07, FEAST_FOR_SIX))], TABLE)
+    """The whole table for six."""
+    usual = Group(six_places(0.535, 0.19, 0.275), food_for_six(0.3))
+    quiet = Group(six_places(0.10, 0.05, 0.85), food_for_six(0.3))
+    feast = Group(six_places(0.95, 0.05, 0.00), food_for_six(0.7))
+    table = Surface([OneOf((0.90, usual), (0.03, quiet), (0.07, feast))], TABLE)
     return Grammar("breakfast_table_high_clutter", get_scene_type("breakfast_table_high_clutter"), [table], at_least(3))
 
 
@@ -152,16 +147,14 @@ def two_places(plate: float, bowl: float, nothing: float) -> Node:
     return Cluster(pair, Gaussian(0.0, 0.0, along=0.0, across=0.2))
 
 
-def shared_for_two(crock_present: float) -> Node:
+def food_for_two(crock_present: float) -> Node:
     return Group(crock(crock_present), shared_plates(0.7, 2, 0.2), shared_bowls(0.7, 2), cereal(0.58), jugs(0.6))
-
-
-USUAL_FOR_TWO = Group(two_places(0.36, 0.12, 0.52), shared_for_two(0.12))
-FEAST_FOR_TWO = Group(two_places(0.90, 0.10, 0.00), shared_for_two(0.90))
 
 
 @register_grammar("breakfast_table_low_clutter")
 def breakfast_table_low_clutter() -> Grammar:
-    """The whole table."""
-    table = Surface([OneOf((0.98, USUAL_FOR_TWO), (0.02, FEAST_FOR_TWO))], TABLE)
+    """The whole table for two."""
+    usual = Group(two_places(0.36, 0.12, 0.52), food_for_two(0.12))
+    feast = Group(two_places(0.90, 0.10, 0.00), food_for_two(0.90))
+    table = Surface([OneOf((0.98, usual), (0.02, feast))], TABLE)
     return Grammar("breakfast_table_low_clutter", get_scene_type("breakfast_table_low_clutter"), [table], at_least(3))

@@ -46,9 +46,7 @@ def steamers(another: float, lid: float, nothing: float, three: float = 0.6) -> 
     return Repeat(
         Stack("steamer_bottom", then, step=STEP, where=Gaussian(along=0.158), at_most=10),
         Geometric(three, 3, 4),
-        such_that={
-            "no stack of 4": lambda stacks: max(len(stack.assets) for stack in stacks) >= 4,
-        },
+        such_that={"no stack of 4": lambda stacks: max(len(stack.assets) for stack in stacks) >= 4},
     )
 
 
@@ -56,16 +54,14 @@ def teapots(present: float) -> Node:
     return Repeat(Object("teapot", Gaussian(along=0.1)), Geometric(0.5, 1, 2, present))
 
 
-USUAL = Group(places(0.70, 0.025, 0.025, 0.20), dishes(0.6), steamers(0.30, 0.40, 0.30), teapots(0.9))
-QUIET = Group(places(0.14, 0.03, 0.03, 0.80), dishes(0.2), steamers(0.15, 0.35, 0.50), teapots(0.4))
-FEAST = Group(places(0.80, 0.025, 0.025, 0.15), dishes(0.6), steamers(0.72, 0.20, 0.08, three=0.5), teapots(0.9))
-
-
 @register_grammar("dimsum_table")
 def dimsum_table() -> Grammar:
     """The whole table."""
+    usual = Group(places(0.70, 0.025, 0.025, 0.20), dishes(0.6), steamers(0.30, 0.40, 0.30), teapots(0.9))
+    quiet = Group(places(0.14, 0.03, 0.03, 0.80), dishes(0.2), steamers(0.15, 0.35, 0.50), teapots(0.4))
+    feast = Group(places(0.80, 0.025, 0.025, 0.15), dishes(0.6), steamers(0.72, 0.20, 0.08, three=0.5), teapots(0.9))
     table = Surface(
-        children=[OneOf((0.86, USUAL), (0.04, QUIET), (0.10, FEAST))],
+        children=[OneOf((0.86, usual), (0.04, quiet), (0.10, feast))],
         region=Region(0.475, 0.475, radius=0.625),
         keep_out=KEEP_OUT,
         footprint=FOOTPRINT,

@@ -89,43 +89,33 @@ def floor(*children: Node) -> Surface:
     return Surface(children, ROOM, keep_out=KEEP_OUT, height=FLOOR, layouts=30)
 
 
-USUAL_HIGH = tables(
-    {3: 0.89, 4: 0.11},
-    laid(Geometric(0.2, 2, 4), another=0.3, lid=0.4, nothing=0.3, setting=0.40, empty=0.50),
-)
-QUIET_HIGH = tables(
-    {3: 1.0},
-    laid(Geometric(0.6, 2, 4), another=0.15, lid=0.4, nothing=0.45, setting=0.1, empty=0.8, dishes=0.3, teapots=0.6),
-)
-FEAST_HIGH = tables(
-    {3: 0.6, 4: 0.4},
-    laid(Geometric(0.2, 3, 4), another=0.6, lid=0.3, nothing=0.1, setting=0.8, empty=0.1),
-)
-
-
 @register_grammar("restaurant_high_clutter")
 def restaurant_high_clutter() -> Grammar:
-    """The whole room."""
-    room = floor(OneOf((0.91, USUAL_HIGH), (0.05, QUIET_HIGH), (0.04, FEAST_HIGH)), shelves(Geometric(0.2, 0, 5)))
+    """The whole room, with three or more tables."""
+    usual = laid(Geometric(0.2, 2, 4), another=0.3, lid=0.4, nothing=0.3, setting=0.40, empty=0.50)
+    few = Geometric(0.6, 2, 4)
+    quiet = laid(few, another=0.15, lid=0.4, nothing=0.45, setting=0.1, empty=0.8, dishes=0.3, teapots=0.6)
+    feast = laid(Geometric(0.2, 3, 4), another=0.6, lid=0.3, nothing=0.1, setting=0.8, empty=0.1)
+    rooms = OneOf(
+        (0.91, tables({3: 0.89, 4: 0.11}, usual)),
+        (0.05, tables({3: 1.0}, quiet)),
+        (0.04, tables({3: 0.6, 4: 0.4}, feast)),
+    )
+    room = floor(rooms, shelves(Geometric(0.2, 0, 5)))
     return Grammar("restaurant_high_clutter", get_scene_type("restaurant_high_clutter"), [room], at_least(32))
-
-
-USUAL_LOW = tables(
-    {1: 0.44, 2: 0.39, 3: 0.13, 4: 0.04},
-    laid(Geometric(0.4, 1, 4), another=0.3, lid=0.4, nothing=0.3, setting=0.52, empty=0.38),
-)
-QUIET_LOW = tables(
-    {1: 1.0},
-    laid(Geometric(0.9, 1, 4), another=0.15, lid=0.4, nothing=0.45, setting=0.1, empty=0.8, dishes=0.2, teapots=0.5),
-)
-FEAST_LOW = tables(
-    {2: 0.3, 3: 0.3, 4: 0.4},
-    laid(Geometric(0.2, 3, 4), another=0.6, lid=0.3, nothing=0.1, setting=0.8, empty=0.1),
-)
 
 
 @register_grammar("restaurant_low_clutter")
 def restaurant_low_clutter() -> Grammar:
-    """The whole room."""
-    room = floor(OneOf((0.95, USUAL_LOW), (0.03, QUIET_LOW), (0.02, FEAST_LOW)), shelves(Geometric(0.25, 0, 3)))
+    """The whole room, with one or more tables."""
+    usual = laid(Geometric(0.4, 1, 4), another=0.3, lid=0.4, nothing=0.3, setting=0.52, empty=0.38)
+    few = Geometric(0.9, 1, 4)
+    quiet = laid(few, another=0.15, lid=0.4, nothing=0.45, setting=0.1, empty=0.8, dishes=0.2, teapots=0.5)
+    feast = laid(Geometric(0.2, 3, 4), another=0.6, lid=0.3, nothing=0.1, setting=0.8, empty=0.1)
+    rooms = OneOf(
+        (0.95, tables({1: 0.44, 2: 0.39, 3: 0.13, 4: 0.04}, usual)),
+        (0.03, tables({1: 1.0}, quiet)),
+        (0.02, tables({2: 0.3, 3: 0.3, 4: 0.4}, feast)),
+    )
+    room = floor(rooms, shelves(Geometric(0.25, 0, 3)))
     return Grammar("restaurant_low_clutter", get_scene_type("restaurant_low_clutter"), [room])

@@ -1,4 +1,4 @@
-"""Shelf: positions of its four tiers, and clearance from its boards."""
+"""Shelves of four tiers: one in a living room with games, toys and food, one in a pantry with goods."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from scene_envs.grammars.dsl import (
 )
 from scene_envs.grammars.grammar import Grammar, register_grammar
 from scene_envs.grammars.layout import Heap, Node, Surface
-from scene_envs.grammars.surface import Line, PositionDistribution, Region, Uniform, Yaw
+from scene_envs.grammars.surface import Line, Region, Uniform, Yaw
 from scene_envs.scene_types import get_scene_type
 
 TIER_HEIGHTS = (-0.3915, -0.1232, 0.1392, 0.4075)
@@ -32,6 +32,19 @@ HALF_DEPTH, HALF_WIDTH = 0.1475, 0.284
 MIDDLE = 0.0025
 """x of the middle of the clear depth (m): the back board takes 5 mm."""
 TIER = Region(HALF_DEPTH, HALF_WIDTH, overhang=0.0, x=MIDDLE)
+ANYWHERE = Uniform(HALF_DEPTH, HALF_WIDTH, x=MIDDLE)
+
+LENGTHWISE = Yaw(std=0.015, choices=(math.pi / 2, -math.pi / 2))
+"""Large games fit lengthwise only."""
+FACING_FRONT = Yaw(std=0.1, choices=(math.pi / 2,))
+"""A speaker's badge faces the room."""
+SQUARE = Yaw(std=0.05, choices=(0.0, math.pi))
+"""Small games lie straight."""
+NEARLY_SQUARE = Yaw(std=0.15, choices=(0.0, math.pi))
+"""Game cases are put down with less care."""
+
+FRUIT = ("apple_gala", "apple_golden", "apple_green", "apple_red", "pear_anjou", "pear_bosc", "pear_red",
+         "avocado_a", "avocado_b", "avocado_c")  # fmt: skip
 
 
 def tiers(inner: Node, top: Node) -> Sequence[Surface]:
@@ -42,29 +55,15 @@ def tiers(inner: Node, top: Node) -> Sequence[Surface]:
     ]
 
 
-ALONG_SHELF = Yaw(std=0.015, choices=(math.pi / 2, -math.pi / 2))
-"""Large games fit lengthwise only."""
-FACING_FRONT = Yaw(std=0.1, choices=(math.pi / 2,))
-"""A speaker's badge faces the room."""
-SQUARE = Yaw(std=0.05, choices=(0.0, math.pi))
-"""Small games lie straight."""
-NEARLY_SQUARE = Yaw(std=0.15, choices=(0.0, math.pi))
-"""Game cases are put down with less care."""
-
-
-def anywhere() -> PositionDistribution:
-    return Uniform(HALF_DEPTH, HALF_WIDTH, x=MIDDLE)
-
-
 def large_games() -> Node:
     """Up to three large games on each other."""
     kinds = ((1.0, "board_game_xl"), (1.0, "board_game_l"), (1.0, "board_game_l2"))
-    return Pile(kinds, Geometric(0.7, 1, 3), Uniform(0.006, 0.06, x=MIDDLE), ALONG_SHELF)
+    return Pile(kinds, Geometric(0.7, 1, 3), Uniform(0.006, 0.06, x=MIDDLE), LENGTHWISE)
 
 
 def small_games() -> Node:
     """Up to four small games on each other: a fifth would not fit under the next board."""
-    return Stack("board_game_s", {"board_game_s": 0.3, None: 0.7}, where=anywhere(), at_most=4, yaw=SQUARE)
+    return Stack("board_game_s", {"board_game_s": 0.3, None: 0.7}, where=ANYWHERE, at_most=4, yaw=SQUARE)
 
 
 def bookend() -> Node:
@@ -75,17 +74,17 @@ def bookend() -> Node:
 
 def plate_of_food() -> Node:
     food = OneOf((1.0, toast(0.2)), (1.0, Object("apple_gala")), (1.0, Object("pear_bosc")), (1.0, NOTHING))
-    return Object("shared_plate", anywhere(), on=middle(food))
+    return Object("shared_plate", ANYWHERE, on=middle(food))
 
 
 def game_cases(p: float) -> Node:
     """Up to three stacks of game cases."""
-    stack = Stack("game_case", {"game_case": 0.3, None: 0.7}, where=anywhere(), yaw=NEARLY_SQUARE)
+    stack = Stack("game_case", {"game_case": 0.3, None: 0.7}, where=ANYWHERE, yaw=NEARLY_SQUARE)
     return Repeat(stack, Geometric(p, 0, 3))
 
 
 def drinks(asset: str, p: float) -> Node:
-    return Repeat(Object(asset, anywhere()), Geometric(p, 0, 6))
+    return Repeat(Object(asset, ANYWHERE), Geometric(p, 0, 6))
 
 
 def tier_objects(toy: float, game: float, p: float) -> Node:
@@ -99,13 +98,13 @@ def tier_objects(toy: float, game: float, p: float) -> Node:
     return Group(
         maybe(toy, bookend()),
         maybe(game, small_games()),
-        maybe(0.1, Object("speaker", anywhere(), FACING_FRONT)),
+        maybe(0.1, Object("speaker", ANYWHERE, FACING_FRONT)),
         maybe(game, plate_of_food()),
         game_cases(p),
         drinks("soda_can", p),
         drinks("tea_bottle", p),
-        maybe(toy, Object("stacking_ring", anywhere())),
-        maybe(toy, Object("toy_train", anywhere())),
+        maybe(toy, Object("stacking_ring", ANYWHERE)),
+        maybe(toy, Object("toy_train", ANYWHERE)),
     )
 
 
@@ -120,30 +119,22 @@ def full_tier() -> Node:
 def top_tier() -> Node:
     """The top of the shelf: lamps, a fruit bowl, small games, a speaker."""
     fruit = OneOf((1.0, Object("apple_gala")), (1.0, Object("pear_bosc")))
-    bowl = Object("fruit_bowl", anywhere(), inside=Heap(Repeat(fruit, Geometric(0.5, 0, 3)), 0.03))
+    bowl = Object("fruit_bowl", ANYWHERE, inside=Heap(Repeat(fruit, Geometric(0.5, 0, 3)), 0.03))
     setting = Group(
         maybe(0.2, bowl),
         maybe(0.3, small_games()),
-        maybe(0.1, Object("speaker", anywhere(), FACING_FRONT)),
-        Repeat(Object("lamp", anywhere()), Geometric(0.8, 0, 2)),
+        maybe(0.1, Object("speaker", ANYWHERE, FACING_FRONT)),
+        Repeat(Object("lamp", ANYWHERE), Geometric(0.8, 0, 2)),
     )
     return OneOf((0.8, setting), (0.1, large_games()), (0.1, NOTHING))
-
-
-USUAL = Tiers(tiers(inner_tier(), top_tier()))
-FULL = Tiers(tiers(full_tier(), top_tier()))
 
 
 @register_grammar("living_room_shelf")
 def living_room_shelf() -> Grammar:
     """The whole shelf."""
-    room = Surface([OneOf((0.98, USUAL), (0.02, FULL))], Region(1.0, 1.0))
+    usual, full = (Tiers(tiers(inner, top_tier())) for inner in (inner_tier(), full_tier()))
+    room = Surface([OneOf((0.98, usual), (0.02, full))], Region(1.0, 1.0))
     return Grammar("living_room_shelf", get_scene_type("living_room_shelf"), [room], at_least(3))
-
-
-FRUIT = ("apple_gala", "apple_golden", "apple_green", "apple_red", "pear_anjou", "pear_bosc", "pear_red",
-         "avocado_a", "avocado_b", "avocado_c")  # fmt: skip
-ANYWHERE = Uniform(HALF_DEPTH, HALF_WIDTH, x=MIDDLE)
 
 
 def goods(p: float) -> Node:
@@ -160,8 +151,7 @@ def fruit_bowl() -> Node:
 
 def pantry(p: float) -> Node:
     """The whole shelf; ``p`` is the parameter of the geometric distribution of the number of each kind."""
-    top = Group(maybe(0.2, fruit_bowl()), goods(p))
-    return Tiers(tiers(goods(p), top))
+    return Tiers(tiers(goods(p), Group(maybe(0.2, fruit_bowl()), goods(p))))
 
 
 @register_grammar("pantry_shelf")

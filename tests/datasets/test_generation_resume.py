@@ -68,7 +68,7 @@ def test_killed_and_started_again_the_files_are_the_same(cups: Path, tmp_path: P
     assert process.exitcode == -signal.SIGKILL
     assert (tmp_path / "scenes-00000.parquet").is_file()
     assert not (tmp_path / "scenes-00001.parquet").exists()
-    (tmp_path / ".scenes-00001.parquet.77.partial").write_bytes(b"PAR1 half a file")  # of yet another process
+    (tmp_path / ".scenes-00001.parquet.999999999.partial").write_bytes(b"PAR1 half a file")  # of a process that ended
     generate_cups(tmp_path)
     assert _hashes(tmp_path) == _hashes(cups)
 
