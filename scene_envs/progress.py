@@ -1,11 +1,10 @@
-"""Progress of long work: a live bar on a terminal, lines elsewhere, both on stderr."""
+"""Words on the terminal: the progress of long work on stderr, a bar or lines; PyBullet without its message."""
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from time import perf_counter
 from types import TracebackType
 from typing import Any
@@ -89,28 +88,23 @@ class Progress:
             self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-@contextlib.contextmanager
-def silence() -> Iterator[None]:
-    """Keep the message that PyBullet prints on import out of the user's terminal."""
+def quiet_pybullet(otherwise: str) -> Any:
+    """The module pybullet, imported without the message that it prints.
+
+    Raises MissingDependencyError with the text ``otherwise`` where it is not installed.
+    """
     sys.stdout.flush()
     sys.stderr.flush()
-    with open(os.devnull, "w") as sink:
-        kept = os.dup(1), os.dup(2)
-        try:
+    kept = os.dup(1), os.dup(2)
+    try:
+        with open(os.devnull, "w") as sink:
             os.dup2(sink.fileno(), 1)
             os.dup2(sink.fileno(), 2)
-            yield
-        finally:
-            for copy, descriptor in zip(kept, (1, 2), strict=True):
-                os.dup2(copy, descriptor)
-                os.close(copy)
-
-
-def quiet_pybullet(otherwise: str) -> Any:
-    """The module pybullet; raises MissingDependencyError with the text ``otherwise`` where it is not installed."""
-    try:
-        with silence():
-            import pybullet
+        import pybullet
     except ImportError as error:
         raise MissingDependencyError(otherwise) from error
+    finally:
+        for copy, descriptor in zip(kept, (1, 2), strict=True):
+            os.dup2(copy, descriptor)
+            os.close(copy)
     return pybullet

@@ -238,12 +238,8 @@ class SceneBatch:
         supports = torch.full(self.categories.shape, -1, dtype=torch.int64)
         for start in range(0, len(supports), _CHUNK):
             rows = slice(start, start + _CHUNK)
-            shapes, placed, slot = Placed.of_scenes(
-                self.scene_type,
-                self.categories[rows].cpu().numpy(),
-                self.translations[rows].double().cpu().numpy(),
-                self.rotations[rows].double().cpu().numpy(),
-            )
+            poses = self.translations[rows], self.rotations[rows]
+            shapes, placed, slot = Placed.of_scenes(self.scene_type, self.categories[rows], *poses)
             below = Contacts.of(shapes, placed).holding().support
             held = below >= 0
             supports[rows][placed.scene[held], slot[held]] = torch.from_numpy(slot[below[held]])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from torch import Tensor
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.assets.support_shapes import LibraryShapes, library_shapes
@@ -38,44 +38,25 @@ class Placed:
     fixed: Mask  # (n,) bool, static or welded
 
     @classmethod
-    def of(
-        cls,
-        shapes: LibraryShapes,
-        scene: Index,
-        category: Index,
-        translation: Array,
-        rotation: Array,
-        welded: Sequence[int] = (),
-    ) -> Placed:
-        """Objects from their poses."""
-        points = rotation @ shapes.points[category] + translation[..., None]
-        center = np.einsum("nij,nj->ni", rotation, shapes.center[category]) + translation
-        height = points[:, 2] - points[:, 2].min(axis=-1, keepdims=True)
-        outward = _DIRECTIONS @ points[:, :2] - _STEEPNESS * height[:, None]  # (n, 8, V)
-        feet = np.take_along_axis(points, outward.argmax(axis=-1)[:, None], axis=-1).swapaxes(1, 2)
-        feet = np.concatenate([feet, feet.mean(axis=1, keepdims=True)], axis=1)
-        fixed = shapes.static[category] | np.isin(category, welded)
-        return cls(scene, category, rotation, translation, center, points, feet, fixed)
-
-    @classmethod
     def of_scenes(
-        cls, scene_type: SceneType, categories: Index, translations: Array, rotations: Array
+        cls, scene_type: SceneType, categories: Tensor, translations: Tensor, rotations: Tensor
     ) -> tuple[LibraryShapes, Placed, Index]:
         """The shapes of the assets, the objects of B scenes, and the slot of each object.
 
         The arguments are categories (B, N), translations (B, N, 3) m and rotations (B, N, 3, 3).
         """
         shapes = library_shapes(scene_type.library)
-        scene, slot = np.nonzero(categories != scene_type.num_assets)
-        placed = cls.of(
-            shapes,
-            scene,
-            categories[scene, slot],
-            translations[scene, slot],
-            rotations[scene, slot],
-            scene_type.welded_categories,
-        )
-        return shapes, placed, slot
+        scene, slot = np.nonzero((categories != scene_type.num_assets).cpu().numpy())
+        category = categories.cpu().numpy()[scene, slot]
+        translation, rotation = (poses.double().cpu().numpy()[scene, slot] for poses in (translations, rotations))
+        points = rotation @ shapes.points[category] + translation[..., None]
+        center = np.einsum("nij,nj->ni", rotation, shapes.center[category]) + translation
+        height = points[:, 2] - points[:, 2].min(axis=-1, keepdims=True)
+        outward = _DIRECTIONS @ points[:, :2] - _STEEPNESS * height[:, None]  # (n, 8, V)
+        feet = np.take_along_axis(points, outward.argmax(axis=-1)[:, None], axis=-1).swapaxes(1, 2)
+        feet = np.concatenate([feet, feet.mean(axis=1, keepdims=True)], axis=1)
+        fixed = shapes.static[category] | np.isin(category, scene_type.welded_categories)
+        return shapes, cls(scene, category, rotation, translation, center, points, feet, fixed), slot
 
 
 @dataclass(frozen=True, eq=False)

@@ -192,8 +192,6 @@ class DenoisingCore:
             info[f"term_{name}"] = np.zeros(self.num_envs) if term is None else term.cpu().numpy().astype(np.float64)
         return info
 
-    # -- transitions ----------------------------------------------------------------------------
-
     @torch.no_grad()
     def reset(
         self,
@@ -212,7 +210,10 @@ class DenoisingCore:
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         if len(rows) == 0:
             return
-        self._x = replace_rows(self._x, rows, torch.cat([self._draw_start(rngs[row]) for row in rows.tolist()]))
+        seeds = [int(rngs[row].integers(2**63)) for row in rows.tolist()]
+        noises = [torch.Generator(self.device).manual_seed(seed) for seed in seeds]
+        starts = torch.cat([self.prior.initial(1, self.slots, noise) for noise in noises])
+        self._x = replace_rows(self._x, rows, starts.clamp(-STATE_BOUND, STATE_BOUND))
         self._steps[rows] = 0
         if self.prompting.given:
             for row in rows.tolist():
@@ -221,22 +222,9 @@ class DenoisingCore:
 
     def _read_prompts(self) -> None:
         """Set the token indices of the prompts; the network encodes them when the encoding is first needed."""
-        reader = self.prompting.reader
-        self._tokens = None if reader is None else self.prompting.read(self._prompts).to(self.device)
+        has_reader = self.prompting.reader is not None
+        self._tokens = self.prompting.read(self._prompts).to(self.device) if has_reader else None
         self._text: tuple[Tensor, ...] | None = None
-
-    def _text_of(self, rows: IntArray) -> tuple[Tensor, ...] | None:
-        """Text tokens of the prompts in ``rows``; encoded once per reset."""
-        reader = self.prompting.reader
-        if reader is None or self._tokens is None:
-            return None
-        if self._text is None:
-            self._text = tuple(reader.encode_tokens(self._tokens))
-        return tuple(take_rows(part, rows) for part in self._text)
-
-    def _draw_start(self, rng: np.random.Generator) -> Tensor:
-        generator = torch.Generator(self.device).manual_seed(int(rng.integers(2**63)))
-        return self.prior.initial(1, self.slots, generator).clamp(-STATE_BOUND, STATE_BOUND)
 
     @torch.no_grad()
     def step(self, action: Any, active: BoolArray | None = None) -> StepResult:
@@ -253,7 +241,11 @@ class DenoisingCore:
         shape = (self.num_envs, self.slots, self.features)
         given = check_action(action, shape, ("environment", "slot", "feature")).to(self.device)
         rows = np.arange(self.num_envs) if active is None else np.flatnonzero(active)
-        self._check_running(rows)
+        stopped = rows[(self._steps[rows] < 0) | (self._steps[rows] >= self.num_steps)]
+        if len(stopped):
+            fresh = bool((self._steps[stopped] < 0).any())
+            what = "was never reset" if fresh else f"ended after its {self.num_steps} steps"
+            raise ResetNeededError(f"the episode of environment {int(stopped[0])} {what}; call reset() first")
         given = given.clamp(-self.max_action, self.max_action)
         for step in np.unique(self._steps[rows]):
             group = rows[self._steps[rows] == step]
@@ -264,20 +256,16 @@ class DenoisingCore:
 
     def _transition(self, x_t: Tensor, action: Tensor, step: int, rows: IntArray) -> Tensor:
         if self.action_mode == "noise":
-            text, reader = self._text_of(rows), self.prompting.reader
-            if text is None or reader is None:
+            reader = self.prompting.reader
+            if reader is None or self._tokens is None:
                 reverse = self.prior.transition(x_t, step, self.table)
             else:
+                if self._text is None:  # encoded once per reset
+                    self._text = tuple(reader.encode_tokens(self._tokens))
+                text = tuple(take_rows(part, rows) for part in self._text)
                 reverse = reader.transition(x_t, step, self.table, text=text, guidance=self.prompting.guidance)
             action = reverse.from_noise(action)
         return self.prior.clamp(action).clamp(-STATE_BOUND, STATE_BOUND)
-
-    def _check_running(self, rows: IntArray) -> None:
-        stopped = rows[(self._steps[rows] < 0) | (self._steps[rows] >= self.num_steps)]
-        if len(stopped):
-            fresh = bool((self._steps[stopped] < 0).any())
-            what = "was never reset" if fresh else f"ended after its {self.num_steps} steps"
-            raise ResetNeededError(f"the episode of environment {int(stopped[0])} {what}; call reset() first")
 
     def _judge(self, ended: IntArray) -> StepResult:
         count, device = self.num_envs, self.device

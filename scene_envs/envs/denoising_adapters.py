@@ -1,4 +1,4 @@
-"""Gymnasium adapter of the denoising MDP: one environment, one scene."""
+"""Adapters of the denoising MDP: a Gymnasium environment of one scene, one of a batch, and one for torchrl."""
 
 from __future__ import annotations
 
@@ -213,11 +213,8 @@ class DenoisingTorchRLEnv(EnvBase):
         super().__init__(device=core.device, batch_size=torch.Size([num_envs]))
         self.core = core
         self.result: StepResult | None = None
-        self._rngs = [seeding.np_random()[0] for _ in range(num_envs)]
-        self._make_specs()
-
-    def _make_specs(self) -> None:
-        core, batch, device = self.core, self.batch_size, self.device
+        self._set_seed(None)
+        batch, device = self.batch_size, self.device
         scene_shape = (*batch, core.slots, core.features)
         self.observation_spec = Composite(
             {
@@ -241,10 +238,8 @@ class DenoisingTorchRLEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Environment i gets the generator of ``seed + i``, as in the vector environment."""
-        if seed is None:
-            self._rngs = [seeding.np_random()[0] for _ in range(self.core.num_envs)]
-        else:
-            self._rngs = [seeding.np_random(int(seed) + i)[0] for i in range(self.core.num_envs)]
+        seeds = _spread_seed(None if seed is None else int(seed), self.core.num_envs)
+        self._rngs = [seeding.np_random(own)[0] for own in seeds]
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, prompts: Sequence[str] | None = None, **kwargs: Any

@@ -179,39 +179,29 @@ def facts_under(batch: SceneBatch, tolerances: Sequence[Tolerances]) -> list[lis
     """The facts of each scene under each of several tolerances; geometry is computed once."""
     result: list[list[SceneFacts]] = [[] for _ in tolerances]
     for start in range(0, len(batch), _CHUNK):
-        for facts, part in zip(result, _chunk(batch[start : start + _CHUNK], tolerances), strict=True):
-            facts += part
+        some = batch[start : start + _CHUNK]
+        display = [asset.display_name for asset in some.scene_type.library]
+        axes = viewer_axes(some.scene_type)
+        shapes, placed, slot = Placed.of_scenes(some.scene_type, some.categories, some.translations, some.rotations)
+        positions = placed.center @ axes.T
+        points = axes @ placed.points
+        boxes = np.stack([points.min(axis=-1), points.max(axis=-1)], axis=1)
+        tiers = np.isfinite(shapes.tiers[placed.category]).sum(axis=1)
+        contacts = Contacts.of(shapes, placed)
+        parts = [slice(*np.searchsorted(placed.scene, (row, row + 1))) for row in range(len(some))]
+        for facts, limits in zip(result, tolerances, strict=True):
+            holding = contacts.holding(limits.contact)
+            facts += [
+                SceneFacts(
+                    tuple(display[c] for c in placed.category[part]),
+                    slot[part],
+                    positions[part],
+                    boxes[part],
+                    placed.fixed[part],
+                    tiers[part],
+                    holding.part(part),
+                    limits,
+                )
+                for part in parts
+            ]
     return result
-
-
-def _chunk(batch: SceneBatch, tolerances: Sequence[Tolerances]) -> list[list[SceneFacts]]:
-    display = [asset.display_name for asset in batch.scene_type.library]
-    shapes, placed, slot = Placed.of_scenes(
-        batch.scene_type,
-        batch.categories.cpu().numpy(),
-        batch.translations.double().cpu().numpy(),
-        batch.rotations.double().cpu().numpy(),
-    )
-    axes = viewer_axes(batch.scene_type)
-    positions = placed.center @ axes.T
-    points = axes @ placed.points
-    boxes = np.stack([points.min(axis=-1), points.max(axis=-1)], axis=1)
-    tiers = np.isfinite(shapes.tiers[placed.category]).sum(axis=1)
-    contacts = Contacts.of(shapes, placed)
-    parts = [slice(*np.searchsorted(placed.scene, (row, row + 1))) for row in range(len(batch))]
-    return [
-        [
-            SceneFacts(
-                tuple(display[c] for c in placed.category[part]),
-                slot[part],
-                positions[part],
-                boxes[part],
-                placed.fixed[part],
-                tiers[part],
-                holding.part(part),
-                limits,
-            )
-            for part in parts
-        ]
-        for limits, holding in ((limits, contacts.holding(limits.contact)) for limits in tolerances)
-    ]

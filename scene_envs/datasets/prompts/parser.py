@@ -148,28 +148,22 @@ def parse_prompt(text: str, scene_type: str | SceneType) -> PromptFacts:
     >>> parse_prompt("A scene where the teapot is behind the second cup from the left.", "dimsum_table").claims[0].side
     'back'
     """
-    return _Reader(text, _words(get_scene_type(scene_type))).prompt()
+    return _Reader(text, *_names(get_scene_type(scene_type))).prompt()
 
 
-class _Words:
-    """Display names and plurals of a scene type."""
-
-    def __init__(self, scene_type: SceneType) -> None:
-        nouns = Nouns(scene_type)
-        self.name = {name.lower(): name for name in nouns.plural}
-        self.plural = {plural.lower(): name for name, plural in nouns.plural.items()}
-
-
-_words = lru_cache(maxsize=32)(_Words)
+@lru_cache(maxsize=32)
+def _names(scene_type: SceneType) -> tuple[dict[str, str], dict[str, str]]:
+    """Display names by their singular and by their plural, both in lower case."""
+    plurals = Nouns(scene_type).plural
+    return {name.lower(): name for name in plurals}, {plural.lower(): name for name, plural in plurals.items()}
 
 
 class _Reader:
     """Recursive descent over the text; every method reads one phrase and moves on."""
 
-    def __init__(self, text: str, words: _Words) -> None:
-        self.text = text
+    def __init__(self, text: str, singular: dict[str, str], plural: dict[str, str]) -> None:
+        self.text, self.singular, self.plural = text, singular, plural
         self.rest = re.sub(r"\s+", " ", text).strip().lower().removesuffix(".").rstrip()
-        self.words = words
 
     def prompt(self) -> PromptFacts:
         self.need(["a scene"], "'A scene with …' or 'A scene where …'")
@@ -243,8 +237,7 @@ class _Reader:
         return _COUNTS[self.need(_COUNTS, "a number")]
 
     def noun(self, *, plural: bool) -> str:
-        names = self.words.plural if plural else self.words.name
-        kind = "plural" if plural else "singular"
+        names, kind = (self.plural, "plural") if plural else (self.singular, "singular")
         return names[self.need(names, f"a {kind} name of this scene type: {', '.join(names)}")]
 
     def edge(self) -> str:
