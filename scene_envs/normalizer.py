@@ -112,13 +112,10 @@ class Normalizer:
             scale, offset, low, high = (torch.tensor(vector, dtype=torch.float32) for vector in vectors)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise InvalidInputError(f"normalizer_state holds values that are no numbers: {str(error)[:200]}") from error
-        shapes = {tuple(vector.shape) for vector in (scale, offset, low, high)}
-        if len(shapes) > 1 or scale.ndim != 1 or not all(map(_is_finite, (scale, offset, low, high))):
+        numbers = (scale, offset, low, high)
+        shapes = {tuple(vector.shape) for vector in numbers}
+        if len(shapes) > 1 or scale.ndim != 1 or not all(bool(torch.isfinite(vector).all()) for vector in numbers):
             raise InvalidInputError(
                 f"normalizer_state needs four lists of finite numbers of one length, it has shapes {sorted(shapes)}"
             )
         return cls(scale, offset, low, high)
-
-
-def _is_finite(vector: Tensor) -> bool:
-    return bool(torch.isfinite(vector).all())

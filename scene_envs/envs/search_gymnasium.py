@@ -374,24 +374,12 @@ class SearchMaskEnv(SearchEnv):
 
     ## Observation Space
 
-    A `Dict` with the keys
-
-    | key | space | meaning |
-    |---|---|---|
-    | `scene` | `Box(-10, 10, (N, D), float32)` | the scene, normalised |
-    | `object_mask` | `MultiBinary(N)` | slots that are not *empty* |
-    | `regenerate` | `MultiBinary((K, N))` | slots that each mask regenerates |
-    | `depth` | `Box(0, max_depth, (1,), int64)` | actions taken |
-    | `value` | `Box(0, 1, (1,), float32)` | Φ of the scene, see Rewards |
-    | `prompt` | `Box(0, V-1, (L,), int64)` | tokens of the prompt, padded with 0; only if `prompt=` is given |
-
-    `info` has the same keys as in `Search-v0`; `regenerate` is the number of slots that are in any mask.
+    The `Dict` of [Search-v0](search.md#observation-space), but `regenerate` is `MultiBinary((K, N))`: the slots that
+    each mask regenerates. `info` has the same keys; its `regenerate` is the number of slots that are in any mask.
 
     ## Rewards
 
-    The reward is Φ(s') - Φ(s). Φ is the objective's value divided by `objective_scale`, clipped to [0, 1]. The
-    rewards of an episode add up to Φ(end) - Φ(root). If the objective cannot score the child, the child takes the
-    parent's Φ, so the reward is 0, and `info["reward_valid"]` is 0.
+    Φ(s') - Φ(s), as in [Search-v0](search.md#rewards).
 
     ## Starting State
 
@@ -433,8 +421,7 @@ class SearchMaskEnv(SearchEnv):
 
     ## Vectorized environment
 
-    `gym.make_vec("scene_envs:SceneEnvs/SearchMask-v0", num_envs=4, ...)` runs copies one after another. Planners should
-    use `expand_batch`, which denoises many children in one batch.
+    As in [Search-v0](search.md#vectorized-environment).
 
     ## Version History
 

@@ -85,7 +85,7 @@ class Grammar:
             towers = [surface.draw(rng, self.reasons) for surface in self.surfaces]
             if not self._accepts([part for row in towers for tower in row for part in tower.walk()]):
                 continue
-            poses = self._place(towers, rng)
+            poses = self._layout.place_all(zip(self.surfaces, towers, strict=True), Frame(), None, rng)
             if poses is not None:
                 self._write(scene, poses)
                 return
@@ -94,15 +94,6 @@ class Grammar:
             f"grammar {self.name!r} made no scene in {structures} structures; "
             f"most frequent reasons: {', '.join(f'{why} ({count})' for why, count in self.reasons.most_common(3))}"
         )
-
-    def _place(self, towers: Sequence[Sequence[Tower]], rng: np.random.Generator) -> list[Pose] | None:
-        poses: list[Pose] = []
-        for surface, row in zip(self.surfaces, towers, strict=True):
-            placed = self._layout.place(surface, row, Frame(), None, rng)
-            if placed is None:
-                return None
-            poses += placed
-        return poses
 
     def _accepts(self, towers: Sequence[Tower]) -> bool:
         failed = next((name for name, holds in self.such_that.items() if not holds(towers)), None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -123,6 +123,8 @@ class Filling(Protocol):
         """A start pose for each of ``contents``, from which it falls into the container."""
 
 
+_SPOTS = 20
+"""Places tried for an object with neighbours."""
 _TRIES = 6
 _SETTLE = 1.5
 """Time (s) in which contents come to rest."""
@@ -270,13 +272,6 @@ class Containers:
         return bool(((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all() and (points[:, 2] > low[2]).all())
 
 
-_SPOTS = 20
-"""Places tried for an object with neighbours."""
-
-Rotation = tuple[float, ...]
-"""A rotation matrix, row-major."""
-
-
 @dataclass(frozen=True)
 class Frame:
     """An upright frame in the world: a place (m) and a yaw (rad)."""
@@ -300,7 +295,7 @@ class Pose:
 
     asset: str
     translation: tuple[float, float, float]
-    rotation: Rotation
+    rotation: tuple[float, ...]  # row-major
 
 
 class Layout:
@@ -322,9 +317,8 @@ class Layout:
         ``frame`` is the frame of the ``carrier``, the asset that carries the surface; it is the world frame without
         a carrier.
         """
-        if surface.height is not None:
-            level = surface.height
-        else:
+        level = surface.height
+        if level is None:
             level = self._height(carrier)[2] if carrier is not None else 0.0
         for _ in range(surface.layouts):
             poses = self._try(surface, towers, frame, frame.z + level, rng)
@@ -359,7 +353,7 @@ class Layout:
     ) -> list[Pose] | None:
         """One tower with everything on it, in it and next to it."""
         if not tower.assets:
-            return self._loads(tower, replace(frame, z=height), None, rng)
+            return self.place_all(tower.loads, replace(frame, z=height), None, rng)
         outline, mark = self._outline(surface, tower.assets), free.mark()
         for _ in range(_SPOTS if tower.beside else 1):
             spot = free.place(tower.where, tower.yaw, outline, rng, len(tower.assets))
@@ -391,13 +385,20 @@ class Layout:
                 z = z + rise if tower.step is None else base + level * tower.step
             poses.append(Pose(asset, (x, y, z), about_z(yaw)))
         frame = Frame(x, y, base, yaws[0])
-        loads = self._loads(tower, frame, tower.assets[0], rng)
+        loads = self.place_all(tower.loads, frame, tower.assets[0], rng)
         contents = self._contents(tower, frame, rng) if tower.contents else []
         return None if loads is None or contents is None else poses + loads + contents
 
-    def _loads(self, tower: Tower, frame: Frame, carrier: str | None, rng: np.random.Generator) -> list[Pose] | None:
+    def place_all(
+        self,
+        loads: Iterable[tuple[Surface, Sequence[Tower]]],
+        frame: Frame,
+        carrier: str | None,
+        rng: np.random.Generator,
+    ) -> list[Pose] | None:
+        """The poses of :meth:`place` for several surfaces, each with its towers."""
         poses: list[Pose] = []
-        for surface, towers in tower.loads:
+        for surface, towers in loads:
             placed = self.place(surface, towers, frame, carrier, rng)
             if placed is None:
                 return None
@@ -432,20 +433,15 @@ class Layout:
     def _outline(self, surface: Surface, assets: tuple[str, ...]) -> Outline:
         key = id(surface), assets
         if key not in self._outlines:
-            bottom = assets[0]
-            if bottom in surface.keep_out:
-                keep_out: tuple[Plan, ...] = (Disc(surface.keep_out[bottom]),)
-            else:
-                keep_out = tuple(self._plan(asset) for asset in assets)
-            if bottom in surface.footprint:
-                footprint: tuple[Plan, ...] = (Disc(surface.footprint[bottom]),)
-            else:
-                footprint = tuple(self._plan(asset) for asset in assets)
+            keep_out, footprint = (
+                (Disc(radii[assets[0]]),) if assets[0] in radii else tuple(self._plan(asset) for asset in assets)
+                for radii in (surface.keep_out, surface.footprint)
+            )
             self._outlines[key] = surface, Outline(keep_out, footprint)  # keeps the surface, so its id stays unique
         return self._outlines[key][1]
 
 
-def about_z(yaw: float) -> Rotation:
-    """The rotation by ``yaw`` (rad) about the vertical."""
+def about_z(yaw: float) -> tuple[float, ...]:
+    """The rotation by ``yaw`` (rad) about the vertical, row-major."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     return (cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0)

@@ -72,10 +72,8 @@ class Uniform:
 
     def draw(self, rng: np.random.Generator) -> tuple[float, float]:
         """One position (x, y), m."""
-        return (
-            self.x + self.half_x * (2.0 * rng.random() - 1.0),
-            self.y + self.half_y * (2.0 * rng.random() - 1.0),
-        )
+        x = self.x + self.half_x * (2.0 * rng.random() - 1.0)
+        return x, self.y + self.half_y * (2.0 * rng.random() - 1.0)
 
     def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(P,) 0 inside, minus infinity outside."""
@@ -92,11 +90,8 @@ class Line:
 
     def draw(self, rng: np.random.Generator) -> tuple[float, float]:
         """One position (x, y), m."""
-        t = rng.random()
-        return (
-            self.start[0] + t * (self.end[0] - self.start[0]),
-            self.start[1] + t * (self.end[1] - self.start[1]),
-        )
+        (x, y), (end_x, end_y), t = self.start, self.end, rng.random()
+        return x + t * (end_x - x), y + t * (end_y - y)
 
     def log_density(self, points: NDArray[np.float64]) -> None:
         """None: a line has no density in the plane."""
@@ -377,22 +372,13 @@ class Region:
         return self.half_x + over, self.half_y + over, max(0.0, self.radius - foot)
 
     @cached_property
-    def _cells(self) -> tuple[NDArray[np.float64], float, float]:
+    def cells(self) -> tuple[NDArray[np.float64], float, float]:
+        """(P, 2) centres of the cells that cover the rectangle, and the two sides of a cell, m."""
         nx, ny = (min(_MAX_CELLS, max(1, math.ceil(2 * half / _CELL))) for half in (self.half_x, self.half_y))
         wide, deep = 2 * self.half_x / nx, 2 * self.half_y / ny
         xs = (np.arange(nx) + 0.5) * wide - self.half_x + self.x
         ys = (np.arange(ny) + 0.5) * deep - self.half_y + self.y
         return np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2), wide, deep
-
-    @property
-    def cells(self) -> NDArray[np.float64]:
-        """(P, 2) cell centres that cover the rectangle, m."""
-        return self._cells[0]
-
-    @property
-    def cell_size(self) -> tuple[float, float]:
-        """Sides of a cell, m."""
-        return self._cells[1], self._cells[2]
 
 
 @dataclass(frozen=True)
@@ -446,15 +432,11 @@ class FreeSurface:
     def fit(self, x: float, y: float, yaws: Sequence[float], outline: Outline) -> list[Placed] | None:
         """The child's keep-outs at (x, y) with one yaw (rad) per level, if it fits there; else None."""
         turns = [(math.cos(yaw), math.sin(yaw)) for yaw in yaws]
-        for plan, (cos, sin) in zip(outline.footprint, turns, strict=False):
-            if not self.region.contains(Placed(plan, x, y, cos, sin)):
-                return None
+        feet = (Placed(plan, x, y, cos, sin) for plan, (cos, sin) in zip(outline.footprint, turns, strict=False))
+        if not all(map(self.region.contains, feet)):
+            return None
         child = [Placed(plan, x, y, cos, sin) for plan, (cos, sin) in zip(outline.keep_out, turns, strict=False)]
-        for other in self._placed:
-            for level in child:
-                if meet(level, other):
-                    return None
-        return child
+        return None if any(meet(level, other) for other in self._placed for level in child) else child
 
     def place(
         self, where: PositionDistribution, yaw: Yaw, outline: Outline, rng: np.random.Generator, levels: int = 1
@@ -469,12 +451,11 @@ class FreeSurface:
         """
         region = self.region
         half_x, half_y, radius = region.limits(outline.foot)
-        keep_out = outline.core
         for _ in range(_DRAWS):
             x, y = where.draw(rng)
             if abs(x - region.x) > half_x or abs(y - region.y) > half_y or x * x + y * y > radius * radius:
                 continue
-            if self._is_taken(x, y, keep_out):
+            if self._is_taken(x, y, outline.core):
                 continue
             spot = self._settle(x, y, yaw, outline, rng, levels)
             if spot is not None:
@@ -482,10 +463,7 @@ class FreeSurface:
         return self._place_in_cells(where, yaw, outline, rng, levels)
 
     def _is_taken(self, x: float, y: float, core: float) -> bool:
-        """Whether a disc of radius ``core`` (m) at (x, y) meets another child's inner disc.
-
-        This test is quick, but misses some overlaps.
-        """
+        """Whether a disc of radius ``core`` (m) at (x, y) meets another child's inner disc; misses some overlaps."""
         for other_x, other_y, other in self._cores:
             dx, dy, reach = x - other_x, y - other_y, core + other
             if dx * dx + dy * dy < reach * reach:
@@ -507,7 +485,7 @@ class FreeSurface:
     def _place_in_cells(
         self, where: PositionDistribution, yaw: Yaw, outline: Outline, rng: np.random.Generator, levels: int
     ) -> tuple[float, float, tuple[float, ...]] | None:
-        cells = self.region.cells
+        cells, wide, deep = self.region.cells
         log_density = where.log_density(cells)
         if log_density is None:
             return None
@@ -515,7 +493,6 @@ class FreeSurface:
         candidates, log_density = cells[free], log_density[free]
         if not len(candidates):
             return None
-        wide, deep = self.region.cell_size
         cumulative = np.cumsum(np.exp(log_density - log_density.max()))
         for _ in range(_DRAWS):
             x, y = candidates[np.searchsorted(cumulative, rng.random() * cumulative[-1], side="right")]
@@ -527,15 +504,12 @@ class FreeSurface:
         return None
 
     def _roomy(self, cells: NDArray[np.float64], outline: Outline) -> NDArray[np.bool_]:
-        """(P,) bool: cells that discs within the plans do not rule out.
-
-        This test is quick, but some of these cells may have no room.
-        """
-        inner, foot = outline.core, outline.foot
-        region = self.region
+        """(P,) bool: cells that discs within the plans do not rule out; some of these may have no room."""
+        inner, foot, region = outline.core, outline.foot, self.region
+        _, wide, deep = region.cells
         free = np.hypot(cells[:, 0], cells[:, 1]) + foot <= region.radius
-        free &= np.abs(cells[:, 0] - region.x) + foot <= region.half_x + region.overhang + region.cell_size[0]
-        free &= np.abs(cells[:, 1] - region.y) + foot <= region.half_y + region.overhang + region.cell_size[1]
+        free &= np.abs(cells[:, 0] - region.x) + foot <= region.half_x + region.overhang + wide
+        free &= np.abs(cells[:, 1] - region.y) + foot <= region.half_y + region.overhang + deep
         for x, y, other in self._cores:
             free &= (cells[:, 0] - x) ** 2 + (cells[:, 1] - y) ** 2 >= (inner + other) ** 2
         return free
