@@ -21,8 +21,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import torch
-
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import Sources, compose, format_rows, help_text, keys_of
 from agents.configuration.composition import (
@@ -485,6 +483,8 @@ def check_device(name: str) -> None:
 
     >>> check_device("cpu")
     """
+    import torch
+
     try:
         device = torch.device(name)
         torch.empty(1, device=device)
