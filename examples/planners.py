@@ -4,8 +4,8 @@
 
 All keys of ``search`` are accepted; those of the planners are the attributes of the two dataclasses. Neither planner is
 ahead of ``greedy`` at equal numbers of scenes (benchmarks/search.md), so the package has neither. They show how a
-planner uses the :class:`~agents.planning.SearchBudget` of a plan, which spends the budget and keeps the best state, and how
-one steers the denoising itself.
+planner uses the :class:`~agents.planning.SearchBudget` of a plan, which spends the budget and keeps the best state,
+and how one steers the denoising itself.
 """
 
 from __future__ import annotations
