@@ -230,14 +230,13 @@ class _Worker:
         self.kill()
 
     def start_clock(self) -> None:
-        """Let the time run after which the worker is ended."""
+        """End the worker when its time is over."""
         if self._timeout is not None:
             self._clock = threading.Timer(self._timeout, self._end_late)
             self._clock.daemon = True
             self._clock.start()
 
     def stop_clock(self) -> None:
-        """Let the time run no longer."""
         if self._clock is not None:
             self._clock.cancel()
 
@@ -409,7 +408,6 @@ class _Actor(_Worker):
 
     @property
     def process_id(self) -> int:
-        """Id of the actor's process in the operating system of its machine."""
         return int(self._ray.get(self._actor.process_id.remote()))
 
     def send(self, body: Any, timeout: float | None) -> None:

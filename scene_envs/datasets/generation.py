@@ -152,7 +152,7 @@ def generate(
     settings = {"grammar": scene_type, "seed": seed, "count": count, "shard_size": shard_size, "verified": verify}
     normalizer = _prepare(folder, grammar, settings)
     sizes = [min(shard_size, count - first) for first in range(0, count, shard_size)]
-    jobs = [Job(index, size, seed, verify, str(folder / shard_name(index))) for index, size in enumerate(sizes)]
+    jobs = [Job(index, size, seed, verify, folder / shard_name(index)) for index, size in enumerate(sizes)]
     left = [job for job in jobs if not _is_made(job)]
     with generation_progress(
         f"Generating {scene_type}", count - sum(job.size for job in left), count, progress
@@ -189,7 +189,7 @@ def _make(
                 "fewer workers"
             ) from shard
         if shard is not None:
-            write_bytes(Path(task.body.path), shard)
+            write_bytes(task.body.path, shard)
 
     with WorkerPool(
         f"{__name__}:ShardMaker",
@@ -278,13 +278,12 @@ def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normal
 
 def _is_made(job: Job) -> bool:
     """Whether the shard exists; raises CorruptFileError when it is damaged or has another number of scenes."""
-    path = Path(job.path)
-    if not path.is_file():
+    if not job.path.is_file():
         return False
-    rows = read_notes(path)["rows"]
+    rows = read_notes(job.path)["rows"]
     if rows != job.size:
-        raise CorruptFileError(f"{job.path!r} holds {rows} scenes, expected {job.size}; delete it and run again")
-    verify(path)
+        raise CorruptFileError(f"{str(job.path)!r} holds {rows} scenes, expected {job.size}; delete it and run again")
+    verify(job.path)
     return True
 
 
@@ -292,8 +291,8 @@ def _report(folder: Path, jobs: list[Job], count: int, seconds: float) -> Genera
     reasons: Counter[str] = Counter()
     tried = 0
     for job in jobs:
-        shard_journal(job).remove()
-        notes = read_notes(Path(job.path))
+        job.journal.remove()
+        notes = read_notes(job.path)
         reasons.update(notes["reasons"])
         tried += notes["tried"]
     return GenerationReport(folder, count, tried, dict(reasons.most_common()), seconds)
@@ -378,7 +377,12 @@ class Job:
     size: int  # number of scenes in the shard
     seed: int  # seed of the dataset
     verify: bool  # whether to keep only scenes that pass ``judge_scenes``
-    path: str  # path of the shard's file
+    path: Path  # path of the shard's file
+
+    @property
+    def journal(self) -> Journal:
+        """The journal of the shard, in the folder of its file."""
+        return Journal(self.path.with_name(f".{self.path.name}.journal"))
 
 
 def make_shard(
@@ -469,15 +473,8 @@ def _judge(scenes: Tensor, grammar: Grammar, normalizer: Normalizer, verify: boo
 
 def write_shard(job: Job, grammar: Grammar, normalizer: Normalizer) -> Generator[tuple[int, int, dict[str, int]]]:
     """Make one shard with a journal, and write it; yields as :func:`make_shard`, raises StorageError."""
-    journal = shard_journal(job)
-    write_bytes(Path(job.path), (yield from make_shard(job, grammar, normalizer, journal)))
-    journal.remove()
-
-
-def shard_journal(job: Job) -> Journal:
-    """The journal of a shard, in the folder of its file."""
-    path = Path(job.path)
-    return Journal(path.with_name(f".{path.name}.journal"))
+    write_bytes(job.path, (yield from make_shard(job, grammar, normalizer, job.journal)))
+    job.journal.remove()
 
 
 class Journal:

@@ -19,6 +19,7 @@ _LOGGER = logging.getLogger(__name__)
 _NO_MESH: Any = None
 """In place of an asset's mesh: workers draw nothing, so meshes are not sent to them."""
 _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""One thread for each worker: there are as many workers as a user wants threads."""
 
 
 class KernelRunner:
@@ -56,6 +57,7 @@ class PhysicsPool(WorkerPool):
     """
 
     def __init__(self, workers: int | None = 1, timeout: float = 60.0, **options: Any) -> None:
+        options = {"environment": _ENVIRONMENT, **options}
         super().__init__(f"{__name__}:KernelRunner", workers=workers, timeout=timeout, **options)
         self._scene_types: dict[tuple[SceneType, tuple[int, ...]], tuple[int, tuple[Asset, ...]]] = {}
 

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -148,3 +149,10 @@ def test_wrong_arguments_and_a_closed_pool_are_refused(batch: SceneBatch) -> Non
     pool.close()
     with pytest.raises(PhysicsError, match="closed"):
         feasibility(batch[:1], pool=pool)
+
+
+def test_a_worker_computes_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[dict[str, Any]] = []
+    monkeypatch.setattr("scene_envs.workers.Process", lambda *_, **options: given.append(options))
+    PhysicsPool(workers=1)._make()
+    assert given[0]["environment"]["OMP_NUM_THREADS"] == "1"
