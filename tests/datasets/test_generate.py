@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from scene_envs.datasets import SceneDataset, generate, judge_scenes
-from scene_envs.datasets import generation
+from scene_envs.datasets import SceneDataset, generate, generation, judge_scenes
 from scene_envs.datasets.generation import generation_progress
 from scene_envs.errors import InvalidInputError, PhysicsError, UnknownNameError
 from scene_envs.grammars import register_grammar

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from scene_envs.datasets import SceneDataset, StorageError, judge_scenes
-from scene_envs.datasets import generation
+from scene_envs.datasets import SceneDataset, StorageError, generation, judge_scenes
 from scene_envs.errors import CorruptFileError
 from scene_envs.scene import SceneBatch
 from tests.helpers.forked import forked

@@ -10,11 +10,10 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from scene_envs import grammars
+from scene_envs import grammars, scene_types
 from scene_envs.datasets import judge_scenes
 from scene_envs.grammars import Grammar
 from scene_envs.grammars.grammar import GRAMMARS
-from scene_envs import scene_types
 
 PAGE = (Path(__file__).parents[2] / "docs" / "grammars.md").read_text()
 BLOCKS = [block for block in re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL) if "gym.make" not in block]
