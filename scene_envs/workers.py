@@ -218,7 +218,7 @@ class _Worker:
         raise answer
 
     def stop(self) -> None:
-        """End the worker, whatever it does."""
+        """End the worker at once."""
         self.is_alive = False
         self.stop_clock()
 
@@ -247,9 +247,9 @@ class _Worker:
         if self._is_late:  # it answered at the last moment, and was ended all the same
             self.stop()
         if kind == "failed":
-            text, told = body
+            text, trace = body
             body = WorkerFailure(text)
-            body.__cause__ = RuntimeError(f"\n{told}")
+            body.__cause__ = RuntimeError(f"\n{trace}")
         elif kind == "refused" and not isinstance(body, SceneEnvsError):
             names, text = body
             body = next(_ERRORS[name] for name in names if name in _ERRORS)(text)
