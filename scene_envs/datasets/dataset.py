@@ -410,7 +410,7 @@ class Layout:
         batch = SceneBatch.from_parts(raw[..., :3], rotations, categories, self.scene_type)
         if self.slots is not None:
             batch = batch.with_slots(self.slots)
-        return place_fixed(batch, self.fixed_tolerance, rows.place, rows.start).tensor
+        return _place_fixed(batch, self.fixed_tolerance, rows).tensor
 
     def _rotations(self, matrices: Tensor, present: Tensor, rows: Rows) -> Tensor:
         gram = matrices.transpose(-1, -2) @ matrices
@@ -425,19 +425,11 @@ class Layout:
         return fitted
 
 
-def place_fixed(batch: SceneBatch, tolerance: float, place: str = "the batch", start: int = 0) -> SceneBatch:
-    """The same scenes with the scene type's fixed objects in the first slots, in order and in their exact poses.
+def _place_fixed(batch: SceneBatch, tolerance: float, rows: Rows) -> SceneBatch:
+    """The scenes of ``rows`` with the scene type's fixed objects in the first slots, in order and in their exact poses.
 
-    Other objects keep their order. A fixed object that a scene lacks is added where a slot is empty.
-
-    Args:
-        batch: B scenes, fixed objects in any slot.
-        tolerance: Largest distance (m, rotation entries) of fixed objects from their poses.
-        place: Source of the scenes, for messages.
-        start: Row of the first scene in the source, for messages.
-
-    Raises:
-        InvalidInputError: a fixed object stands elsewhere, or is missing from a scene without an empty slot.
+    Other objects keep their order. A fixed object that a scene lacks is added where a slot is empty; one that is
+    farther than ``tolerance`` (m, rotation entries) from its pose is refused.
     """
     tensor = batch.tensor.clone()
     for slot, fixed in enumerate(batch.scene_type.fixed):
@@ -455,30 +447,24 @@ def place_fixed(batch: SceneBatch, tolerance: float, place: str = "the batch", s
             row = int(torch.nonzero(off)[0])
             pose = [round(value, 4) for value in rest[row, int(nearest[row]), POSE].tolist()]
             raise InvalidInputError(
-                f"row {start + row} of {place} has the fixed {fixed.asset!r} at {pose[:3]} m, rotation {pose[3:]}; "
-                f"scene type {batch.scene_type.name!r} has it at {list(fixed.translation)} m, rotation "
+                f"row {rows.start + row} of {rows.place} has the fixed {fixed.asset!r} at {pose[:3]} m, rotation "
+                f"{pose[3:]}; scene type {batch.scene_type.name!r} has it at {list(fixed.translation)} m, rotation "
                 f"{list(fixed.rotation)}. Move the scenes, or accept and overwrite it with fixed_tolerance=math.inf"
             )
         is_empty = rest[..., -1] > 0.5
         lost = ~there & ~is_empty.any(dim=1)
         if bool(lost.any()):
             raise InvalidInputError(
-                f"row {start + int(torch.nonzero(lost)[0])} of {place} lacks the fixed {fixed.asset!r} of "
+                f"row {rows.start + int(torch.nonzero(lost)[0])} of {rows.place} lacks the fixed {fixed.asset!r} of "
                 f"{batch.scene_type.name!r} and has no empty slot for it; pass slots={tensor.shape[1] + 1}"
             )
         source = slot + torch.where(there, nearest, is_empty.int().argmax(dim=1))
-        tensor = _to_slot(tensor, source, slot)
+        index = torch.arange(tensor.shape[1]).expand(tensor.shape[:2])
+        moves_up = (index > slot) & (index <= source[:, None])
+        index = torch.where(moves_up, index - 1, index)  # the object of slot ``source`` is replaced by ``wanted``
+        tensor = tensor.gather(1, index[..., None].expand_as(tensor))
         tensor[:, slot] = wanted
     return SceneBatch(tensor, batch.scene_type)
-
-
-def _to_slot(tensor: Tensor, source: Tensor, slot: int) -> Tensor:
-    """Slot ``source`` (B,) moved to ``slot``; the slots between move up by one."""
-    index = torch.arange(tensor.shape[1]).expand(tensor.shape[:2])
-    moved = (index > slot) & (index <= source[:, None])
-    index = torch.where(moved, index - 1, index)
-    index[:, slot] = source
-    return tensor.gather(1, index[..., None].expand_as(tensor))
 
 
 def _require_none(bad: Tensor, rows: Rows, what: str) -> None:
