@@ -13,7 +13,7 @@ from typing import Any
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.files import exists, is_file
 
-SHIPPED = Path(__file__).parent / "priors" / "shipped"
+SHIPPED = Path(__file__).parents[1] / "priors" / "shipped"
 """Folder of the priors that ship with the package."""
 CONFIG_NAME = "config.json"
 _MOST_NAME = 1000
