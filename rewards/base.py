@@ -104,6 +104,11 @@ def counts_objects(*rewards: object) -> bool:
     return any(bool(getattr(reward, "counts_objects", False)) for reward in rewards)
 
 
+def facts_of(reward: object) -> dict[str, bool]:
+    """Whether ``reward`` depends on its batch, averages objects and counts objects, by the name of the attribute."""
+    return {fact.__name__: fact(reward) for fact in (depends_on_batch, averages_objects, counts_objects)}
+
+
 def declared_maximum(reward: object, slots: int, free_slots: int) -> float | None:
     """The largest value that a reward declares for scenes of this size; None if it declares no positive number.
 

@@ -13,23 +13,27 @@ import torch
 from torch import Tensor
 
 from agents.configuration.composition import MEASURE_NAMES
+from agents.evaluation.classifier import Accuracy, classifier_accuracy
 from agents.evaluation.layouts import (
     Neighbors,
+    category_kl,
+    count_wasserstein,
     duplicates,
+    height_errors,
     nearest_scenes,
     novelty,
+    out_of_workspace_rate,
     spacing_wasserstein,
     stack_wasserstein,
     tallest_stacks,
-)
-from agents.evaluation.metrics import (
-    category_kl,
-    count_wasserstein,
-    height_errors,
-    out_of_workspace_rate,
     workspace_fraction,
 )
 from agents.evaluation.physics_figures import physics_figures, ready_figures
+from agents.evaluation.pictures import (
+    frechet_inception_distance,
+    frechet_scene_distance,
+    render_classifier_accuracy,
+)
 from agents.evaluation.prompt_following import CHANCE_PREFIX, own_prompts, prompt_chance, prompt_following
 from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -39,9 +43,12 @@ from scene_envs.scene_types import SceneType
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
 
-
 FLOOR_PREFIX = "floor_"
 """Prefix of the figures of real scenes measured against other real scenes."""
+_FLOOR_SEED = 1_000_003
+"""Added to the seed of the grammar for the second set of scenes."""
+
+Figures = dict[str, float]
 
 
 class Sampler(Protocol):
@@ -174,10 +181,6 @@ def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]
     return figures
 
 
-_FLOOR_SEED = 1_000_003
-"""Added to the seed of the grammar for the second set of scenes."""
-
-
 @dataclass(frozen=True)
 class RealScenes:
     """Disjoint sets of real scenes.
@@ -251,6 +254,8 @@ def _split(
     folder: str, heldout: str, scene_type: SceneType, count: int, training: int, seed: int
 ) -> tuple[SceneBatch, SceneBatch, SceneBatch]:
     """Reference, floor and training scenes of one folder; no scene is in two of them."""
+    from scene_envs.datasets.dataset import scene_keys
+
     whole = _read(folder, scene_type)
     if heldout:
         held, train = _distinct(_read(heldout, scene_type)), whole
@@ -263,7 +268,7 @@ def _split(
             f"{heldout or folder!r} has {len(held)} distinct held-out scenes; at least 4 are needed, half of them for "
             "the real-against-real floor: generate more, or name a folder with more as heldout="
         )
-    train = train[~np.isin(_keys(train), _keys(held))]
+    train = train[~np.isin(scene_keys(train), scene_keys(held))]
     if not len(train):
         raise InvalidInputError(
             f"all scenes of data={folder!r} are held-out scenes too; novelty has nothing to compare"
@@ -276,8 +281,7 @@ def _split(
 def _in_turn(parts: list[SceneBatch]) -> SceneBatch:
     """The scenes of all parts, in turn, so that any first scenes are from all parts."""
     numbers = torch.cat([torch.arange(len(part)) for part in parts])
-    whole = SceneBatch.concatenate(parts)
-    return whole[numbers.argsort(stable=True)]
+    return SceneBatch.concatenate(parts)[numbers.argsort(stable=True)]
 
 
 def _read(folder: str, scene_type: SceneType) -> Tensor:
@@ -298,21 +302,14 @@ def _read(folder: str, scene_type: SceneType) -> Tensor:
 
 
 def _distinct(tensor: Tensor) -> Tensor:
-    _, first = np.unique(_keys(tensor), return_index=True)
-    return tensor[torch.from_numpy(np.sort(first))]
-
-
-def _keys(tensor: Tensor) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
     from scene_envs.datasets.dataset import scene_keys
 
-    return scene_keys(tensor)
+    _, first = np.unique(scene_keys(tensor), return_index=True)
+    return tensor[torch.from_numpy(np.sort(first))]
 
 
 def _folders(text: str) -> list[str]:
     return [folder.strip() for folder in text.split(",") if folder.strip()]
-
-
-Figures = dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -361,40 +358,17 @@ def _with_floor(measure: Callable[[SceneBatch], Figures], inputs: EvaluationInpu
     return {**measure(inputs.samples), **real}
 
 
-def _classifier(inputs: EvaluationInputs) -> Figures:
-    from agents.evaluation.classifier import classifier_accuracy
-
+def _accuracy(name: str, classify: Callable[..., Accuracy], inputs: EvaluationInputs) -> Figures:
     def measure(batch: SceneBatch) -> Figures:
-        accuracy = classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
-        return {"classifier_accuracy": accuracy.mean, "classifier_accuracy_std": accuracy.std}
+        accuracy = classify(inputs.real.reference, batch, seed=inputs.seed)
+        return {name: accuracy.mean, f"{name}_std": accuracy.std}
 
     return _with_floor(measure, inputs)
-
-
-def _renders(inputs: EvaluationInputs) -> Figures:
-    from agents.evaluation.pictures import render_classifier_accuracy
-
-    def measure(batch: SceneBatch) -> Figures:
-        accuracy = render_classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
-        return {"render_accuracy": accuracy.mean, "render_accuracy_std": accuracy.std}
-
-    return _with_floor(measure, inputs)
-
-
-def _fsd(inputs: EvaluationInputs) -> Figures:
-    from agents.evaluation.pictures import frechet_scene_distance
-
-    return _with_floor(
-        lambda batch: {"frechet_scene_distance": frechet_scene_distance(batch, inputs.real.reference)}, inputs
-    )
 
 
 def _fid(inputs: EvaluationInputs) -> Figures:
-    from agents.evaluation.pictures import frechet_inception_distance
-
     if not inputs.fid_weights:
         raise InvalidInputError("FID needs fid_weights=, the path of an Inception-v3's weights")
-
     real, weights = inputs.real.reference, inputs.fid_weights
     return _with_floor(
         lambda batch: {"frechet_inception_distance": frechet_inception_distance(batch, real, weights)}, inputs
@@ -431,11 +405,13 @@ MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
     "layout": lambda inputs: _with_floor(lambda batch: layout_figures(batch, inputs.real.reference), inputs),
     "physics": lambda inputs: _with_floor(lambda batch: physics_figures(batch, inputs.pool), inputs),
     "ready": lambda inputs: _with_floor(lambda batch: ready_figures(batch, inputs.pool), inputs),
-    "fsd": _fsd,
+    "fsd": lambda inputs: _with_floor(
+        lambda batch: {"frechet_scene_distance": frechet_scene_distance(batch, inputs.real.reference)}, inputs
+    ),
     "novelty": _novelty,
     "prompts": _prompts,
-    "classifier": _classifier,
-    "renders": _renders,
+    "classifier": lambda inputs: _accuracy("classifier_accuracy", classifier_accuracy, inputs),
+    "renders": lambda inputs: _accuracy("render_accuracy", render_classifier_accuracy, inputs),
     "fid": _fid,
 }
 """Groups of measures, in the order in which they are computed: cheap ones first."""

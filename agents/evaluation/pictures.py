@@ -1,4 +1,4 @@
-"""Fréchet Inception distance of renders, for users who have the weights of an Inception-v3."""
+"""Fréchet distances of scenes and of their renders, and a classifier of renders."""
 
 from __future__ import annotations
 
@@ -21,6 +21,14 @@ from scene_envs.scene_distance import check_same_assets
 
 if TYPE_CHECKING:
     from agents.evaluation.set_encoder import SetEncoder
+
+WIDTH, HEIGHT = 96, 72
+"""Default size of the renders of the classifier, pixels."""
+
+_SIDE = 299
+_FID_CLASSES = 1008
+"""Classes of the TensorFlow network of 2015, with which FIDs are computed; torchvision's own network has 1000."""
+_COLOR_FEATURES = 6
 
 
 def frechet_scene_distance(a: SceneBatch, b: SceneBatch, *, encoder: SetEncoder | None = None) -> float:
@@ -88,11 +96,6 @@ def _check_count(first: int, second: int) -> None:
         raise InvalidInputError(f"a Fréchet distance needs at least two scenes on both sides, got {first} and {second}")
 
 
-_SIDE = 299
-_FID_CLASSES = 1008
-"""Classes of the TensorFlow network of 2015, with which FIDs are computed; torchvision's own network has 1000."""
-
-
 def frechet_inception_distance(
     a: SceneBatch,
     b: SceneBatch,
@@ -125,8 +128,7 @@ def frechet_inception_distance(
         CorruptFileError: the file is not a state dict of such a network.
     """
     network = load_inception(weights)
-    features = [_features(network, batch, width, height, batch_size) for batch in (a, b)]
-    return feature_distance(*features)
+    return feature_distance(*(_features(network, batch, width, height, batch_size) for batch in (a, b)))
 
 
 def load_inception(weights: str | os.PathLike[str]) -> nn.Module:
@@ -209,12 +211,6 @@ def _features(network: nn.Module, batch: SceneBatch, width: int, height: int, ba
     return np.concatenate(parts) if parts else np.empty((0, 2048))
 
 
-WIDTH, HEIGHT = 96, 72
-"""Default size of the renders, pixels."""
-
-_COLOR_FEATURES = 6
-
-
 def render_classifier_accuracy(
     real: SceneBatch,
     fake: SceneBatch,
@@ -265,16 +261,7 @@ def render_classifier_accuracy(
 
 
 def class_images(batches: list[SceneBatch], width: int, height: int) -> tuple[Tensor, int]:
-    """Semantic renders as class indices.
-
-    Args:
-        batches: scenes of one type.
-        width: width of the renders in pixels.
-        height: height of the renders in pixels.
-
-    Returns:
-        (B, H, W) uint8 indices of the colours of all renders, and the number of colours.
-    """
+    """(B, H, W) uint8 indices of the colours of the semantic renders of all scenes, and the number of colours."""
     from scene_envs.render import render
 
     images = np.concatenate([render(b, style="semantic", width=width, height=height) for b in batches])

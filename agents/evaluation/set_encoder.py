@@ -83,8 +83,6 @@ class SetEncoder(nn.Module):
         self.train(was_training)
         return (raw - self.mean) @ self.whitening
 
-    # -- files ----------------------------------------------------------------------------------
-
     def save(self, path: str | os.PathLike[str], note: str = "") -> Path:
         """Write weights (float16; mean and whitening float32), vocabulary and size to one ``.safetensors`` file.
 

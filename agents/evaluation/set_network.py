@@ -31,6 +31,10 @@ _TIE_BREAK = (7.1e-5, 5.3e-5, 3.1e-5)
 choose between them."""
 _FAR = 1e6
 _CHUNK = 256
+_PRIOR_COUNT = 4.0
+"""Weight, in objects, of the variance over all groups in the variance of one group."""
+_CLIP = 8.0
+_MIN_STD = 1e-4
 
 
 @dataclass(frozen=True)
@@ -107,18 +111,13 @@ def blurred(
     return batch.with_poses(batch.translations + shift, turn @ batch.rotations)
 
 
-def asset_extents(batch: SceneBatch) -> Tensor:
-    """(C + 1, 2, 3) m: lowest and highest corner of each asset in its own frame; zeros for empty."""
-    bounds = [asset.bounds for asset in batch.scene_type.library]
-    return torch.tensor(np.stack([*bounds, np.zeros((2, 3))]), dtype=torch.float32)
-
-
 def _tokens(batch: SceneBatch, neighbours: int) -> SceneTokens:
     order = batch.is_empty.to(torch.uint8).argsort(dim=1, stable=True)[:, : max(1, int(batch.counts.max()))]
     categories = batch.categories.gather(1, order)
     poses = batch.tensor[..., :12].gather(1, order[..., None].expand(-1, -1, 12))
     present = categories != batch.scene_type.num_assets
-    bounds = asset_extents(batch)[categories]  # (B, N, 2, 3)
+    corners = np.stack([*(asset.bounds for asset in batch.scene_type.library), np.zeros((2, 3))])
+    bounds = torch.tensor(corners, dtype=torch.float32)[categories]  # (B, N, 2, 3): lowest and highest, 0 for empty
     translations, rotations = poses[..., :3], poses[..., 3:].unflatten(-1, (3, 3))
     half = 0.5 * (bounds[..., 1, :] - bounds[..., 0, :])
     center = translations + (rotations @ bounds.mean(dim=-2)[..., None])[..., 0]
@@ -267,8 +266,7 @@ class _ObjectEncoder(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Tokens (B, N, H), 0 for padding, and the mask (B, 1, 1, N) of attention to them; arguments as in forward."""
         there = present[..., None].to(own.dtype)
-        pairs = self.pair(offsets) + self.pair_other(neighbours) + self.pair_self(categories)[:, :, None]
-        pairs = F.gelu(pairs)
+        pairs = F.gelu(self.pair(offsets) + self.pair_other(neighbours) + self.pair_self(categories)[:, :, None])
         around = torch.cat([pairs.mean(dim=2), pairs.amax(dim=2)], dim=-1)
         tokens = self.enter(torch.cat([F.gelu(self.own(own) + self.category(categories)), around], dim=-1))
         somewhere = present.any(dim=-1, keepdim=True)
@@ -351,12 +349,6 @@ class SetNetwork(_ObjectEncoder):
         return self.leave(self.norm(summary))
 
 
-_PRIOR_COUNT = 4.0
-"""Weight, in objects, of the variance over all groups in the variance of one group."""
-_CLIP = 8.0
-_MIN_STD = 1e-4
-
-
 @dataclass(frozen=True)
 class Moments:
     """Mean and standard deviation (G, F) of each of G groups."""
@@ -405,15 +397,10 @@ class TypicalPlaces:
 
     def inputs(self, tokens: SceneTokens) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Arguments of a :class:`~agents.evaluation.set_network.SetNetwork` for these scenes."""
-        own, pairs = self._deviations(tokens)
-        own = torch.cat([own, tokens.waves], dim=-1)
-        return own, tokens.categories, pairs, tokens.neighbours, tokens.present
-
-    def _deviations(self, tokens: SceneTokens) -> tuple[Tensor, Tensor]:
-        """Deviations of the poses (B, N, 24) and of the offsets (B, N, K, 14)."""
         there = (tokens.neighbours != self.width - 1)[..., None]
-        pairs = self.offsets.deviations(tokens.offsets, _pairs(tokens, self.width)) * there
-        return self.poses.deviations(tokens.poses, tokens.categories), pairs
+        pairs = self.offsets.deviations(tokens.offsets, _pairs(tokens, self.width)) * there  # (B, N, K, 14)
+        own = torch.cat([self.poses.deviations(tokens.poses, tokens.categories), tokens.waves], dim=-1)
+        return own, tokens.categories, pairs, tokens.neighbours, tokens.present
 
 
 def _pairs(tokens: SceneTokens, width: int) -> Tensor:

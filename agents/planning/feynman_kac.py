@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from agents.planning.ledger import (
     PlannerSettings,
@@ -21,7 +19,11 @@ from agents.planning.ledger import (
 )
 from agents.planning.simple import GreedyPlanner
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import SceneBatch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from scene_envs.scene import SceneBatch
 
 
 def systematic(weights: np.ndarray, uniform: float) -> np.ndarray:
@@ -75,6 +77,8 @@ class Particles:
 
     def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch]) -> Tensor | None:
         """(B,) index of the particle that each place continues with; None at a step without resampling."""
+        import torch
+
         if step not in self.at(steps):
             return None
         now = self.values(denoised()).double().numpy()
