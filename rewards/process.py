@@ -246,14 +246,7 @@ class SeededReward:
 def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: float = 1.0, workers: int = 0) -> Any:
     """A reward as runs use it: one of this package in this process, any other in a process that can be ended.
 
-    Functions and objects, which exist in this process alone, stay in it.
-
-    Args:
-        reward: whatever names a reward.
-        seed: of the run.
-        timeout: as for :class:`IsolatedReward`, like the arguments that follow.
-        memory: GiB.
-        workers: physics workers.
+    Functions and objects, which exist in this process alone, stay in it. Arguments as for :class:`IsolatedReward`.
 
     >>> run_reward("object_count")
     ObjectCount()
@@ -272,12 +265,7 @@ def describe_rewards(
     """Each name with its listing, or with the reason why the reward cannot be used.
 
     Rewards of installed packages are imported in another process. If one of them exits, crashes or hangs at its import,
-    the others are still listed.
-
-    Args:
-        names: registered names.
-        timeout: seconds that an import may take.
-        memory: GiB that an import may allocate.
+    the others are still listed. An import may take ``timeout`` seconds and ``memory`` GiB.
     """
     worker: Process | None = None
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,13 +14,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.evaluation.classifier import Accuracy, ClassifierConfig, Forward, Split, check_classes, two_sample_accuracy
+from agents.evaluation.set_network import SetEncoder
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 from scene_envs.files import read_tensors
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_distance import check_same_assets
-
-if TYPE_CHECKING:
-    from agents.evaluation.set_encoder import SetEncoder
 
 WIDTH, HEIGHT = 96, 72
 """Default size of the renders of the classifier, pixels."""
@@ -49,8 +47,6 @@ def frechet_scene_distance(a: SceneBatch, b: SceneBatch, *, encoder: SetEncoder 
     Raises:
         InvalidInputError: a batch has fewer than two scenes.
     """
-    from agents.evaluation.set_encoder import SetEncoder
-
     _check_count(len(a), len(b))
     encoder = SetEncoder.load() if encoder is None else encoder
     return feature_distance(encoder.features(a).numpy(), encoder.features(b).numpy())

@@ -50,15 +50,8 @@ class Particles:
 
     At ``resamplings`` steps, each group is resampled with the weights exp(strength * (value - value at the last
     resampling)). The product of the weights of a path is then exp(strength * last value) (Singhal et al. 2025,
-    difference potential).
-
-    Args:
-        parents: (B,) parent of each particle, any hashable.
-        rngs: random generator of each parent.
-        values: function from denoised scenes to their values Φ (B,).
-        resamplings: number of resamplings.
-        begin: share of the denoising steps before the first resampling.
-        strength: factor on the values in the weights.
+    difference potential). ``parents`` (B,) are hashable and have a generator each in ``rngs``; ``values`` gives Φ (B,)
+    of denoised scenes.
     """
 
     def __init__(

@@ -143,13 +143,7 @@ def _sizes(batch: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class Guidance:
-    """Gradient of a log-weight at the scenes that the network expects.
-
-    Args:
-        weight: the log-weight.
-        strength: factor on the log-weight.
-        begin: share of the denoising steps that come before guidance.
-    """
+    """Gradient of a log-weight, times ``strength``, at the scenes that the network expects; none before ``begin``."""
 
     role = "guide"
 

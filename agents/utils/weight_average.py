@@ -45,12 +45,7 @@ class WeightAverage:
 
     @torch.no_grad()
     def restore(self, tensors: Mapping[str, Tensor], updates: int | None = None) -> None:
-        """Take the averages of a checkpoint, on the device of the present ones.
-
-        Args:
-            tensors: averages by the name of their parameter.
-            updates: number of updates that made them; None keeps the present number.
-        """
+        """Take the averages of a checkpoint, and the number of ``updates`` that made them, if it is given."""
         for name, present in self.tensors.items():
             present.copy_(tensors[name])
         self.updates = self.updates if updates is None else updates
@@ -63,12 +58,7 @@ class WeightAverage:
 
 
 class AveragedWeights(Generic[Module]):
-    """Context in which a module has its averaged weights; at the end it gets its own weights back.
-
-    Args:
-        module: module that takes part in the exchange.
-        average: average of the parameters; None leaves the module unchanged.
-    """
+    """Context in which a module has its averaged weights, if there is an ``average``; it gets its own back at the end."""
 
     def __init__(self, module: Module, average: WeightAverage | None) -> None:
         self.module, self.average = module, average
