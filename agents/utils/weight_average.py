@@ -58,7 +58,7 @@ class WeightAverage:
 
 
 class AveragedWeights(Generic[Module]):
-    """Context in which a module has its averaged weights, if there is an ``average``; it gets its own back at the end."""
+    """Context in which a module has its averaged weights, if there is an ``average``; then it gets its own back."""
 
     def __init__(self, module: Module, average: WeightAverage | None) -> None:
         self.module, self.average = module, average
