@@ -240,14 +240,10 @@ def fitted(rate: Tensor, like: Tensor) -> Tensor:
 def draw_unmasked(masked: Tensor, chance: Tensor, uniform: Tensor) -> Tensor:
     """(B, N) bool: of the ``masked`` slots of each scene, those that are unmasked now, drawn without replacement.
 
-    Of M masked slots with chance p, M p rounded down or up are unmasked, up with the probability that makes M p the
-    mean. The ranks of independent numbers do not depend on their minimum. So one number per slot is enough: the
-    ranks choose the slots, and the minimum decides the rounding.
-
-    Args:
-        masked: (B, N) bool, the masked slots.
-        chance: (B, N) probability that a masked slot is unmasked, equal for all slots of a scene.
-        uniform: (B, N) independent numbers, uniform on [0, 1).
+    Every masked slot of a scene has the same ``chance`` (B, N). Of M masked slots with chance p, M p rounded down or up
+    are unmasked, up with the probability that makes M p the mean. The ranks of independent numbers do not depend on
+    their minimum. So one number per slot is enough: the ranks choose the slots, and the minimum decides the rounding.
+    These numbers ``uniform`` (B, N) are on [0, 1).
 
     >>> masked = torch.tensor([[True, True, False, True, True]])
     >>> draw_unmasked(masked, torch.full((1, 5), 0.5), torch.tensor([[0.4, 0.9, 0.0, 0.2, 0.6]])).tolist()
@@ -266,11 +262,8 @@ def systematic(unmasked: Tensor, uniform: Tensor) -> Tensor:
 
     Systematic sampling (Madow and Madow 1944): with k slots the numbers are (r + v) / k with the ranks r of ``uniform``
     among these slots and one v for all, the fractional part of their sum. Ranks and v are independent, so each number
-    is uniform. Slots of equal probabilities p take a category p k times, rounded down or up.
-
-    Args:
-        unmasked: (B, N) bool, the slots that a step unmasks.
-        uniform: (B, N) float64, independent and uniform on [0, 1); slots that are not unmasked keep theirs.
+    is uniform. Slots of equal probabilities p take a category p k times, rounded down or up. ``uniform`` (B, N) is
+    independent and uniform on [0, 1); slots that are not unmasked keep theirs.
 
     >>> unmasked = torch.tensor([[True, True, False, True, True]])
     >>> systematic(unmasked, torch.tensor([[0.75, 0.25, 0.5, 0.5, 0.125]])).tolist()
@@ -285,11 +278,8 @@ def systematic(unmasked: Tensor, uniform: Tensor) -> Tensor:
 def unmasking_log_prob(masked: Tensor, chance: Tensor, unmasked: Tensor) -> Tensor:
     """(B, N) nats, whose sum over a scene's slots is the log-probability that exactly ``unmasked`` are unmasked.
 
-    It depends on no parameter of a network; the masked slots of a scene have equal shares of it.
-
-    Args:
-        masked, chance: the arguments of :func:`draw_unmasked`.
-        unmasked: (B, N) bool, a subset of the masked slots.
+    It depends on no parameter of a network; the masked slots of a scene have equal shares of it. ``unmasked`` (B, N) is
+    a subset of the masked slots; the other arguments are those of :func:`draw_unmasked`.
 
     >>> masked, chance = torch.ones(1, 4, dtype=torch.bool), torch.full((1, 4), 0.5)
     >>> two = torch.tensor([[True, False, True, False]])

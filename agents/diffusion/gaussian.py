@@ -523,22 +523,13 @@ def check_weighting(kind: str, prediction: str) -> None:
         )
 
 
-def loss_weights(
-    schedule: NoiseSchedule, t: Tensor, prediction: str, kind: str, gamma: float = MIN_SNR_GAMMA
-) -> Tensor:
-    """(B,) float32 weights of the mean squares of the network's error at timesteps ``t``.
+def loss_weights(schedule: NoiseSchedule, t: Tensor, prediction: str, kind: str) -> Tensor:
+    """(B,) float32 weights of the mean squares of the network's error at timesteps ``t`` (B,), int64 in 1..T.
 
     ``"none"`` is 1 everywhere. ``"min_snr"`` (Hang et al. 2023, Eq. 8) gives the error of the clean scene the weight
-    min(SNR, gamma), SNR being alpha_t^2 / sigma_t^2. The squared error of the noise is SNR times that of the
-    clean scene, and the squared error of v is SNR + 1 times that of the clean scene. So their weights are
-    min(SNR, gamma) / SNR and min(SNR, gamma) / (SNR + 1).
-
-    Args:
-        schedule: noise schedule.
-        t: (B,) int64 in 1..T.
-        prediction: one of :data:`~agents.diffusion.gaussian.PREDICTIONS`.
-        kind: one of :data:`LOSS_WEIGHTINGS`.
-        gamma: largest signal-to-noise ratio in the weight.
+    min(SNR, gamma), with gamma :data:`MIN_SNR_GAMMA` and SNR being alpha_t^2 / sigma_t^2. The squared error of the
+    noise is SNR times that of the clean scene, and the squared error of v is SNR + 1 times that of the clean scene. So
+    their weights are min(SNR, gamma) / SNR and min(SNR, gamma) / (SNR + 1).
 
     Raises:
         UnknownNameError, InvalidInputError: the errors of :func:`check_weighting`.
@@ -552,7 +543,7 @@ def loss_weights(
     alpha_bar = schedule.alpha_bar[t.cpu()]
     snr = alpha_bar / (1.0 - alpha_bar)
     over = {"epsilon": snr, "v": snr + 1.0, "x0": torch.ones_like(snr)}[prediction]
-    return (snr.clamp(max=gamma) / over).float().to(t.device)
+    return (snr.clamp(max=MIN_SNR_GAMMA) / over).float().to(t.device)
 
 
 def timestep_distribution(timesteps: str | None, prediction: str) -> str:

@@ -392,7 +392,7 @@ def category_distribution(batch: SceneBatch, eps: float = KL_EPS) -> Tensor:
     return shares / shares.sum()
 
 
-def category_kl(batch: SceneBatch, reference: SceneBatch, eps: float = KL_EPS) -> float:
+def category_kl(batch: SceneBatch, reference: SceneBatch) -> float:
     """KL(reference ‖ samples) of the category distributions, nats; 0 when they agree.
 
     The paper's category KL (section 4): it punishes assets that the samples lack.
@@ -401,7 +401,7 @@ def category_kl(batch: SceneBatch, reference: SceneBatch, eps: float = KL_EPS) -
     0.0
     """
     check_same_assets(batch, reference)
-    p, q = category_distribution(reference, eps), category_distribution(batch, eps)
+    p, q = category_distribution(reference), category_distribution(batch)
     return float((p * (p / q).log()).sum())
 
 
@@ -486,11 +486,12 @@ def _near(batch: SceneBatch, names: Sequence[str], reach: float) -> Tensor:
     return near & _is_one_of(batch, names).unsqueeze(1)
 
 
-def _contained(batch: SceneBatch, containers: Sequence[Container] = CONTAINERS) -> Tensor:
+def _contained(batch: SceneBatch) -> Tensor:
+    """(B, N) bool: the object lies in a container."""
     z = batch.translations[..., 2].double()
     rise = z.unsqueeze(2) - z.unsqueeze(1)  # (B, rider, container)
     inside = torch.zeros_like(batch.is_empty)
-    for container in containers:
+    for container in CONTAINERS:
         if not set(container.names) & set(batch.scene_type.assets):
             continue
         held = _near(batch, container.names, container.reach) & (rise > 0.01) & (rise <= container.depth)

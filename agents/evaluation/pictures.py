@@ -67,13 +67,7 @@ def gaussian_distance(mean_a: ArrayLike, cov_a: ArrayLike, mean_b: ArrayLike, co
     """Squared 2-Wasserstein distance of two Gaussians (Dowson and Landau 1982).
 
     ``|m_a - m_b|² + tr(S_a + S_b - 2 (S_a^½ S_b S_a^½)^½)``, by symmetric eigendecompositions, which also work for
-    singular covariances.
-
-    Args:
-        mean_a: (F,) mean of the first Gaussian.
-        cov_a: (F, F) covariance of the first Gaussian, symmetric and positive semi-definite.
-        mean_b: (F,) mean of the second Gaussian.
-        cov_b: (F, F) covariance of the second Gaussian.
+    singular covariances (F, F); means are (F,).
 
     >>> gaussian_distance([0.0], [[1.0]], [3.0], [[4.0]])
     10.0

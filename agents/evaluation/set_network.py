@@ -181,29 +181,17 @@ def _padded(values: Tensor, dim: int, size: int, fill: float) -> Tensor:
 
 @dataclass(frozen=True)
 class SetNetworkConfig:
-    """Size of a :class:`SetNetwork`.
+    """Size of a :class:`SetNetwork`."""
 
-    Attributes:
-        features: number of features of an object.
-        categories: number of category tokens, those for *empty* and *unknown* included.
-        outputs: number of outputs for a scene.
-        hidden: width of the tokens; a multiple of ``heads``.
-        heads: number of attention heads.
-        blocks: number of induced attention blocks.
-        inducing: number of inducing points per block.
-        dropout: share of the pooled features dropped in training.
-        pair_features: number of features of each neighbour of an object.
-    """
-
-    features: int
-    categories: int
-    outputs: int
-    hidden: int = 32
+    features: int  # of an object
+    categories: int  # tokens, those for *empty* and *unknown* included
+    outputs: int  # for a scene
+    hidden: int = 32  # width of the tokens, a multiple of ``heads``
     heads: int = 2
-    blocks: int = 1
-    inducing: int = 8
-    dropout: float = 0.1
-    pair_features: int = NEIGHBOUR_FEATURES
+    blocks: int = 1  # of induced attention
+    inducing: int = 8  # points per block
+    dropout: float = 0.1  # share of the pooled features dropped in training
+    pair_features: int = NEIGHBOUR_FEATURES  # of each neighbour of an object
 
     def __post_init__(self) -> None:
         if self.hidden % self.heads:

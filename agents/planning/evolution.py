@@ -115,14 +115,7 @@ def spliced(
 
     The plane has a random direction. Its place is the one at which most objects are kept. About a quarter of the
     objects of both scenes together, or more, are on either side. If there are too few slots, the objects nearest to the
-    plane are left out.
-
-    Args:
-        first: a batch of one; the scene has its fixed objects.
-        second: a batch of one of the same shape.
-        first_mask: (N,) bool, slots of ``first`` that are left out.
-        second_mask: (N,) bool, slots of ``second`` that are left out.
-        rng: draws the direction.
+    plane are left out. The scene has the fixed objects of ``first``; slots of the masks (N,) are left out.
 
     Returns:
         (N, D) raw scene.

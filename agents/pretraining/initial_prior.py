@@ -56,7 +56,12 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
 
     A run from an older prior takes the scene type of its data; if a grammar makes the data, it takes that of the prior.
     """
-    older = _older(config) if config.prior else None
+    older = PriorFacts.of(config.prior) if config.prior else None
+    if older is not None and config.text.is_read and not older.text:
+        raise InvalidInputError(
+            f"text={config.text.encoder} with prior={config.prior!r}, which reads no prompts; leave text= out, or "
+            "train a fresh prior"
+        )
     if config.data == "grammar":
         if older is not None:
             config = replace(config, scene=older.scene_type)
@@ -73,13 +78,11 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
     if "," in config.data:
         return _prepare_union(config)
     dataset = SceneDataset.load(config.data)
-    name = dataset.scene_type.name
+    name, asked = dataset.scene_type.name, str(getattr(config.scene, "name", config.scene))
     if older is not None:
         config = replace(config, scene=name)
-    elif name != _name_of(config.scene):
-        raise InvalidInputError(
-            f"data={config.data!r} holds scenes of {name!r}, and scene={_name_of(config.scene)}; give scene={name}"
-        )
+    elif name != asked:
+        raise InvalidInputError(f"data={config.data!r} holds scenes of {name!r}, and scene={asked}; give scene={name}")
     if len(dataset) < 2:
         raise InvalidInputError(
             f"data={config.data!r} has {len(dataset)} scenes; one is held out, so give at least two"
@@ -97,21 +100,6 @@ def _heldout(folder: str, scene_type: str) -> SceneDataset:
             f"heldout={folder!r} holds scenes of {found.scene_type.name!r}, the training scenes are of {scene_type!r}"
         )
     return found
-
-
-def _name_of(scene: Any) -> str:
-    return str(getattr(scene, "name", scene))
-
-
-def _older(config: PretrainConfig) -> PriorFacts:
-    """Facts of the prior that the run starts from; raises InvalidInputError if the run needs text and it reads none."""
-    older = PriorFacts.of(config.prior)
-    if config.text.is_read and not older.text:
-        raise InvalidInputError(
-            f"text={config.text.encoder} with prior={config.prior!r}, which reads no prompts; leave text= out, or "
-            "train a fresh prior"
-        )
-    return older
 
 
 def split_heldout(dataset: SceneDataset) -> tuple[SceneDataset, SceneDataset]:
@@ -264,19 +252,11 @@ def _chain(config: PretrainConfig) -> dict[str, Any]:
 def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextConfig | None:
     if not config.text.is_read:
         return None
-    text = config.text.vocabulary
     encoder = text_config(config.text.encoder, (prompt for group in prompts for prompt in group))
-    if isinstance(encoder, TextConfig):
-        return replace(
-            encoder,
-            width=text.width,
-            depth=text.depth,
-            latents=text.latents,
-            window=text.window,
-            numbers=text.numbers,
-            count_tokens=max(_kinds(config.scene)) + 2 if _conditions_counts(config) else 0,
-        )
-    return encoder
+    if not isinstance(encoder, TextConfig):
+        return encoder
+    sizes = {name: getattr(config.text.vocabulary, name) for name in ("width", "depth", "latents", "window", "numbers")}
+    return replace(encoder, count_tokens=max(_kinds(config.scene)) + 2 if _conditions_counts(config) else 0, **sizes)
 
 
 def _network(
@@ -366,12 +346,7 @@ class TrainingData(Protocol):
 
 
 class SceneTable:
-    """Scenes in memory, drawn with replacement.
-
-    Args:
-        scenes: (M, N, D) scenes as the prior encodes them.
-        prompts: prompts of every scene; may be empty if draws need no prompts.
-    """
+    """Scenes (M, N, D) in memory as the prior encodes them, drawn with replacement, and the prompts of every scene."""
 
     def __init__(self, scenes: Tensor, prompts: Sequence[Sequence[str]] = ()) -> None:
         self.scenes = scenes
@@ -389,12 +364,7 @@ class SceneTable:
 
 
 class UnionTable:
-    """Scenes of several types in memory, as scenes of their union; each type is as likely as the others.
-
-    Args:
-        datasets: one dataset per scene type.
-        prior: prior of the union, which encodes the drawn scenes.
-    """
+    """Scenes of several types in memory, as the prior of their union encodes them; all types are equally likely."""
 
     def __init__(self, datasets: Sequence[SceneDataset], prior: ScenePrior) -> None:
         self.datasets = datasets
@@ -427,21 +397,13 @@ class UnionTable:
 
 
 class GrammarStream:
-    """Endless fresh scenes of a grammar, not verified by physics.
+    """Endless fresh scenes of a grammar as the prior encodes them, not verified by physics."""
 
-    Args:
-        grammar: grammar of the scenes.
-        prior: prior that encodes the scenes.
-    """
+    size = 0
 
     def __init__(self, grammar: Grammar, prior: ScenePrior) -> None:
         self.grammar = grammar
         self.prior = prior
-
-    @property
-    def size(self) -> int:
-        """0, because the stream is endless."""
-        return 0
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:
         """See :class:`TrainingData`."""

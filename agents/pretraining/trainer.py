@@ -197,7 +197,9 @@ class Pretrainer:
             last = self.step == config.iterations
             row: dict[str, float] = {}
             if self.step % config.logger.evaluate_every == 0 or last:
-                row["heldout"] = self._evaluate()
+                with self._averaged():
+                    row["heldout"] = heldout_loss(self.prior, self.heldout_data.to(config.device))
+                self.evaluations.append({"step": self.step, "heldout": row["heldout"]})
             if self.step % config.logger.log_every == 0 or row:
                 row |= {"step": self.step, "loss": sum(running) / len(running), "gradient_norm": norm}
                 row |= {"learning_rate": learning_rate_at(self.step - 1, config), "seconds": round(self.seconds, 1)}
@@ -263,12 +265,6 @@ class Pretrainer:
             group["initial_lr"] = group["rate"]
         return LambdaLR(self.optimizer, lambda step: learning_rate_at(step, self.config), last_epoch=self.step - 1)
 
-    def _evaluate(self) -> float:
-        with self._averaged():
-            value = heldout_loss(self.prior, self.heldout_data.to(self.config.device))
-        self.evaluations.append({"step": self.step, "heldout": value})
-        return value
-
     def _averaged(self) -> AveragedWeights[nn.Module]:
         return AveragedWeights(self.network, self.average)
 
@@ -290,11 +286,16 @@ class Pretrainer:
 
     def _load(self) -> None:
         state = load_checkpoint(self.checkpoint_path)
-        before = self._started_with(state)
-        if before:
+        before, now = dotted(state["config"]), dotted(asdict(self.config))
+        differing = [
+            f"{key}={value}"
+            for key, value in before.items()
+            if key.partition(".")[0] not in _MAY_DIFFER and value != now.get(key, value)
+        ]
+        if differing:
             raise InvalidInputError(
-                f"{str(self.directory)!r} holds a run that was started with {before}; give the same keys again to "
-                "resume it, or another output"
+                f"{str(self.directory)!r} holds a run that was started with {', '.join(differing)}; give the same keys "
+                "again to resume it, or another output"
             )
         facts, known = self._data_facts(), state.get("data")
         if known is not None and not (
@@ -327,16 +328,6 @@ class Pretrainer:
         heldout = self.heldout_data.double()
         mean = torch.stack([heldout.mean(dim=(0, 1)), heldout.square().mean(dim=(0, 1))])
         return {"scenes": [self.data.size or 0, len(heldout)], "mean": mean}
-
-    def _started_with(self, state: dict[str, Any]) -> str:
-        """Keys of the checkpoint's run whose values differ from this run's; empty if none do."""
-        before, now = dotted(state["config"]), dotted(asdict(self.config))
-        keys = [
-            f"{key}={value}"
-            for key, value in before.items()
-            if key.partition(".")[0] not in _MAY_DIFFER and value != now.get(key, value)
-        ]
-        return ", ".join(keys)
 
     def save_prior(self) -> ScenePrior:
         """Write the prior with averaged weights to ``output/prior``, and return it."""

@@ -13,13 +13,10 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class WeightAverage:
-    """Exponential moving average of a module's parameters.
+    """Exponential moving average of a module's parameters, with a final ``decay``.
 
-    Args:
-        module: module to average.
-        decay: final decay.
-        warm_up: updates after which the decay is one half, if the final decay is not reached before; 0 for the final
-            decay from the first update on.
+    After ``warm_up`` updates the decay is one half, unless the final decay is less; with 0 it is final from the first
+    on.
 
     >>> layer = nn.Linear(1, 1)
     >>> average = WeightAverage(layer, decay=0.5)
