@@ -138,6 +138,17 @@ class CategoricalProcess:
         masked = masked.clamp(0.0, 1.0)
         return torch.minimum(kept, 1.0 - masked), masked
 
+    def transition(self, start: int, end: int) -> Tensor:
+        """(K + 1, K + 1) float64, row i the distribution of the state at ``end`` given state i at ``start``."""
+        keep, mask = self.rates(start, end)
+        k = self.categories
+        matrix = torch.zeros(k + 1, k + 1, dtype=torch.float64)
+        matrix[:k, :k] = _replaced(keep, mask) / k
+        matrix[:k, :k] += keep * torch.eye(k, dtype=torch.float64)
+        matrix[:k, k] = mask
+        matrix[k, k] = 1.0
+        return matrix
+
     def marginal(self, x0: Tensor, t: Tensor) -> Tensor:
         """q(x_t | x_0) (..., K + 1) of data ``x0`` (...), int64, at timesteps ``t`` that broadcast against it."""
         keep, mask = torch.broadcast_tensors(*self._rates_at(t, x0))

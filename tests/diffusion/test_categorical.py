@@ -22,23 +22,12 @@ def _process(name: str, steps: int = T) -> CategoricalProcess:
     return CategoricalProcess(make_categorical_schedule(name, steps), K)
 
 
-def _transition(process: CategoricalProcess, start: int, end: int) -> torch.Tensor:
-    """(K + 1, K + 1) float64, row i the distribution of the state at ``end`` given state i at ``start``."""
-    keep, mask = process.rates(start, end)
-    matrix = torch.zeros(K + 1, K + 1, dtype=torch.float64)
-    matrix[:K, :K] = (1 - keep - mask).clamp(min=0) / K
-    matrix[:K, :K] += keep * torch.eye(K, dtype=torch.float64)
-    matrix[:K, K] = mask
-    matrix[K, K] = 1.0
-    return matrix
-
-
 @pytest.mark.parametrize("name", KERNELS)
 def test_rows_sum_to_one_and_rates_start_at_the_data(name: str) -> None:
     process = _process(name)
     for start in range(T):
         for end in range(start + 1, T + 1):
-            matrix = _transition(process, start, end)
+            matrix = process.transition(start, end)
             assert float(matrix.min()) >= -1e-12
             torch.testing.assert_close(matrix.sum(dim=1), torch.ones(K + 1, dtype=torch.float64))
     assert process.schedule.keep[0] == 1
@@ -50,12 +39,12 @@ def test_rows_sum_to_one_and_rates_start_at_the_data(name: str) -> None:
 def test_strides_compose(name: str) -> None:
     process = _process(name)
     for middle in (1, 7, 19):
-        composed = _transition(process, 0, middle) @ _transition(process, middle, T)
-        torch.testing.assert_close(composed, _transition(process, 0, T), atol=1e-12, rtol=0)
-    single = _transition(process, 0, 1)
+        composed = process.transition(0, middle) @ process.transition(middle, T)
+        torch.testing.assert_close(composed, process.transition(0, T), atol=1e-12, rtol=0)
+    single = process.transition(0, 1)
     for t in range(1, T):
-        single = single @ _transition(process, t, t + 1)
-    torch.testing.assert_close(single, _transition(process, 0, T), atol=1e-12, rtol=0)
+        single = single @ process.transition(t, t + 1)
+    torch.testing.assert_close(single, process.transition(0, T), atol=1e-12, rtol=0)
 
 
 @pytest.mark.parametrize("name", KERNELS)
@@ -65,11 +54,11 @@ def test_the_posterior_is_bayes_rule(name: str, t: int, s: int) -> None:
     generator = torch.Generator().manual_seed(0)
     p0 = torch.rand(K, generator=generator, dtype=torch.float64)
     p0 /= p0.sum()
-    to_s, s_to_t = _transition(process, 0, s)[:K], _transition(process, s, t)
+    to_s, s_to_t = process.transition(0, s)[:K], process.transition(s, t)
     if s == 0:
-        to_s, s_to_t = torch.eye(K, K + 1, dtype=torch.float64), _transition(process, 0, t)
+        to_s, s_to_t = torch.eye(K, K + 1, dtype=torch.float64), process.transition(0, t)
     for state in range(K + 1):
-        likelihood = _transition(process, 0, t)[:K, state]
+        likelihood = process.transition(0, t)[:K, state]
         if not (likelihood > 0).any():
             continue
         expected = torch.zeros(K + 1, dtype=torch.float64)
@@ -86,12 +75,12 @@ def test_few_steps_of_the_true_denoiser_reach_the_data_whatever_their_number(nam
     """With one slot and the exact p(x_0 | x_t), the marginal of every chain is the data's distribution."""
     process = _process(name)
     data = torch.tensor([0.4, 0.3, 0.2, 0.1, 0.0], dtype=torch.float64)
-    start = data @ _transition(process, 0, T)[:K]
+    start = data @ process.transition(0, T)[:K]
     for steps in (1, 2, 5, 7, T):
         state = start
         table = StepTable.spaced(T, steps)
         for t, s in zip(table.timesteps.tolist(), table.previous.tolist(), strict=True):
-            joint = data[:, None] * _transition(process, 0, t)[:K]  # (x_0, x_t)
+            joint = data[:, None] * process.transition(0, t)[:K]  # (x_0, x_t)
             x0_probs = (joint / joint.sum(dim=0).clamp(min=1e-30)).T  # rows x_t
             step = process.posterior(torch.arange(K + 1), x0_probs, t, s)
             state = state @ step
@@ -107,14 +96,14 @@ def test_one_stride_is_the_composed_chain_of_single_steps(name: str, t: int, s: 
     data = torch.tensor([0.4, 0.3, 0.2, 0.1, 0.0], dtype=torch.float64)
 
     def reverse(start: int, end: int) -> torch.Tensor:
-        joint = data[:, None] * _transition(process, 0, start)[:K]  # (x_0, x_t)
+        joint = data[:, None] * process.transition(0, start)[:K]  # (x_0, x_t)
         x0_probs = (joint / joint.sum(dim=0).clamp(min=1e-30)).T
         return process.posterior(torch.arange(K + 1), x0_probs, start, end)
 
     composed = torch.eye(K + 1, dtype=torch.float64)
     for level in range(t, s, -1):
         composed = composed @ reverse(level, level - 1)
-    possible = (data @ _transition(process, 0, t)[:K]) > 1e-12
+    possible = (data @ process.transition(0, t)[:K]) > 1e-12
     torch.testing.assert_close(composed[possible], reverse(t, s)[possible], atol=1e-9, rtol=0)
 
 
@@ -133,7 +122,7 @@ def test_noise_is_drawn_from_the_marginal() -> None:
     drawn = process.add_noise(x0, t, torch.Generator().manual_seed(0)).bincount(minlength=K + 1) / 40_000
     expected = process.marginal(x0[:1], t[:1])[0]
     torch.testing.assert_close(drawn, expected, atol=0.01, rtol=0)
-    torch.testing.assert_close(expected.double(), _transition(process, 0, 50)[2], atol=1e-6, rtol=0)
+    torch.testing.assert_close(expected.double(), process.transition(0, 50)[2], atol=1e-6, rtol=0)
 
 
 def test_sampling_follows_probabilities_and_never_draws_impossible_ones() -> None:
