@@ -11,8 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.evaluation.set_encoder import FEATURES, SetEncoder
-from agents.evaluation.set_network import blurred, scene_tokens
+from agents.evaluation.set_network import FEATURES, SetEncoder, blurred, scene_tokens
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type

@@ -18,10 +18,9 @@ from rewards.check import check_reward
 from rewards.clutter import Clutter
 from rewards.composite import Clip, Gate, Product, WeightedSum
 from rewards.counts import CategoryCount, ObjectCount
-from rewards.coverage import Coverage
-from rewards.diversity import Diversity
+from rewards.diversity import Coverage, Diversity
 from rewards.evaluation import evaluate_reward
-from rewards.feasible import FeasibleObjects, FeasibleShare
+from rewards.feasible import FeasibleObjects, FeasibleShare, Stability
 from rewards.penetration import Penetration
 from rewards.process import IsolatedReward
 from rewards.prompt_match import PromptMatch, Relation
@@ -39,7 +38,6 @@ from rewards.registry import (
     reward_label,
     reward_name,
 )
-from rewards.stability import Stability
 
 __all__ = [
     "CategoryCount",

@@ -104,13 +104,16 @@ def counts_objects(*rewards: object) -> bool:
     return any(bool(getattr(reward, "counts_objects", False)) for reward in rewards)
 
 
+def facts_of(reward: object) -> dict[str, bool]:
+    """Whether ``reward`` depends on its batch, averages objects and counts objects, by the name of the attribute."""
+    return {fact.__name__: fact(reward) for fact in (depends_on_batch, averages_objects, counts_objects)}
+
+
 def declared_maximum(reward: object, slots: int, free_slots: int) -> float | None:
     """The largest value that a reward declares for scenes of this size; None if it declares no positive number.
 
-    Args:
-        reward: reward with an attribute ``maximum``, a number or a method that takes the two arguments below.
-        slots: number of slots per scene.
-        free_slots: number of slots without fixed objects.
+    The attribute ``maximum`` of the reward is a number, or a method of the number of slots per scene, and of those
+    without fixed objects.
 
     >>> class Share:
     ...     maximum = 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -72,7 +73,6 @@ class _Subject:
         self.generator = Generator().manual_seed(seed)
         self.empty = SceneBatch.empty(scene_type, 2)
         self.random = random_scenes(scene_type, 4, self.generator)
-        self._random_output: RewardOutput | None = None
         self._calls = 0
 
     def score(self, batch: SceneBatch) -> RewardOutput:
@@ -85,11 +85,9 @@ class _Subject:
         with other_draw(self._calls):  # a reward that draws random numbers then gives another score
             return evaluate_reward(self.reward, batch, context, strict=True)
 
-    @property
+    @cached_property
     def random_output(self) -> RewardOutput:
-        if self._random_output is None:
-            self._random_output = self.score(self.random)
-        return self._random_output
+        return self.score(self.random)
 
 
 def random_scenes(scene_type: SceneType, count: int, generator: Generator) -> SceneBatch:
@@ -101,14 +99,10 @@ def random_scenes(scene_type: SceneType, count: int, generator: Generator) -> Sc
     categories = torch.tensor(free)[torch.randint(len(free), (count, slots), generator=generator)]
     taken = fixed + (torch.linspace(0, 1, count) * (slots - fixed)).long()
     categories[torch.arange(slots) >= taken.unsqueeze(-1)] = scene_type.num_assets
-    yaw = 2 * torch.pi * torch.rand(count, slots, generator=generator)
-    rotations = yaw_matrix(yaw)
+    rotations = yaw_matrix(2 * torch.pi * torch.rand(count, slots, generator=generator))
     translations = low + (high - low) * torch.rand(count, slots, 3, generator=generator)
-    for target, source in (
-        (categories, batch.categories),
-        (rotations, batch.rotations),
-        (translations, batch.translations),
-    ):
+    own = batch.categories, batch.rotations, batch.translations
+    for target, source in zip((categories, rotations, translations), own, strict=True):
         target[:, :fixed] = source[:, :fixed]
     return SceneBatch.from_parts(translations, rotations, categories, scene_type)
 

@@ -38,15 +38,12 @@ class Clutter:
     """
 
     name: ClassVar[str] = "clutter"
+    maximum: ClassVar[float] = 1.0
     lines: int = 128
 
     def __post_init__(self) -> None:
         if self.lines < 1:
             raise InvalidInputError(f"clutter: lines={self.lines} must be at least 1")
-
-    def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value, of fully covered surfaces."""
-        return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Measure covered lengths along parallel lines over each surface.
@@ -91,19 +88,12 @@ class Clutter:
 
 @dataclass(frozen=True)
 class _Lines:
-    """M parallel lines over a surface, at equal distances.
+    """M parallel lines over a surface, at equal distances."""
 
-    Attributes:
-        y: (M,) positions of the lines, m.
-        step: distance of two lines, m.
-        low: (M,) start of the surface along each line, m.
-        high: (M,) end of the surface along each line, m.
-    """
-
-    y: Array
-    step: float
-    low: Array
-    high: Array
+    y: Array  # (M,) positions, m
+    step: float  # distance of two lines, m
+    low: Array  # (M,) start of the surface along each line, m
+    high: Array  # (M,) its end, m
 
     @classmethod
     def over(cls, corners: Array, count: int) -> _Lines:

@@ -22,6 +22,7 @@ from rewards.base import (
     counts_objects,
     declared_maximum,
     depends_on_batch,
+    parts_of,
 )
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
@@ -29,8 +30,33 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
 
+class _Composite:
+    """A reward that depends on its batch if a part does."""
+
+    @property
+    def depends_on_batch(self) -> bool:
+        """Whether a part depends on the batch."""
+        return depends_on_batch(*parts_of(self))
+
+
+class _Changed(_Composite):
+    """A composite that is of the kind of its part ``reward``."""
+
+    reward: Any
+
+    @property
+    def averages_objects(self) -> bool:
+        """Whether ``reward`` is a mean over the objects."""
+        return averages_objects(self.reward)
+
+    @property
+    def counts_objects(self) -> bool:
+        """Whether ``reward`` depends on which objects there are."""
+        return counts_objects(self.reward)
+
+
 @register_reward("weighted_sum")
-class WeightedSum:
+class WeightedSum(_Composite):
     """Sum of rewards, each times its weight.
 
     ``per_object`` is the weighted sum of the parts' credits when all of them give one. If some parts are means over the
@@ -57,11 +83,6 @@ class WeightedSum:
         self.offset = float(offset)
         self.averages_objects = averages_objects(*self.rewards)
         self.counts_objects = counts_objects(*self.rewards)
-
-    @property
-    def depends_on_batch(self) -> bool:
-        """Whether a part depends on the batch."""
-        return depends_on_batch(*self.rewards)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score every part and add up."""
@@ -92,7 +113,7 @@ class WeightedSum:
 
 
 @register_reward("product")
-class Product:
+class Product(_Composite):
     """Product of rewards; 0 if one of them is 0.
 
     Args:
@@ -107,11 +128,6 @@ class Product:
     def __init__(self, rewards: Sequence[Any]) -> None:
         self.rewards = _resolve_parts(self.name, rewards)
 
-    @property
-    def depends_on_batch(self) -> bool:
-        """Whether a part depends on the batch."""
-        return depends_on_batch(*self.rewards)
-
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score every part and multiply."""
         outputs = _score_parts(self.rewards, batch, context)
@@ -123,7 +139,7 @@ class Product:
 
 @register_reward("gate")
 @dataclass(frozen=True)
-class Gate:
+class Gate(_Changed):
     """A reward that counts only where another one reaches a threshold.
 
     Attributes:
@@ -147,21 +163,6 @@ class Gate:
         object.__setattr__(self, "reward", resolve_reward(self.reward))
         object.__setattr__(self, "condition", resolve_reward(self.condition))
 
-    @property
-    def depends_on_batch(self) -> bool:
-        """Whether ``reward`` or ``condition`` depends on the batch."""
-        return depends_on_batch(self.reward, self.condition)
-
-    @property
-    def averages_objects(self) -> bool:
-        """Whether ``reward`` is a mean over the objects."""
-        return averages_objects(self.reward)
-
-    @property
-    def counts_objects(self) -> bool:
-        """Whether ``reward`` depends on which objects there are."""
-        return counts_objects(self.reward)
-
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score both; credit per object is that of ``reward`` where the gate is open, else 0."""
         outputs = _score_parts((self.reward, self.condition), batch, context)
@@ -174,7 +175,7 @@ class Gate:
 
 @register_reward("clip")
 @dataclass(frozen=True)
-class Clip:
+class Clip(_Changed):
     """A reward kept between two bounds.
 
     Attributes:
@@ -198,26 +199,10 @@ class Clip:
         if self.low is not None and self.high is not None and self.low > self.high:
             raise InvalidInputError(f"clip: low={self.low} is above high={self.high}")
 
-    @property
-    def depends_on_batch(self) -> bool:
-        """Whether ``reward`` depends on the batch."""
-        return depends_on_batch(self.reward)
-
-    @property
-    def averages_objects(self) -> bool:
-        """Whether ``reward`` is a mean over the objects."""
-        return averages_objects(self.reward)
-
-    @property
-    def counts_objects(self) -> bool:
-        """Whether ``reward`` depends on which objects there are."""
-        return counts_objects(self.reward)
-
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """``high``, or the largest value of the reward where that is less."""
-        inner = declared_maximum(resolve_reward(self.reward), slots, free_slots)
-        bounds = [bound for bound in (self.high, inner) if bound is not None]
-        return min(bounds, default=None)
+        bounds = self.high, declared_maximum(self.reward, slots, free_slots)
+        return min((bound for bound in bounds if bound is not None), default=None)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score and clip; scenes beyond a bound give their objects no credit."""

@@ -19,20 +19,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rewards.base import (
-    RewardContext,
-    RewardOutput,
-    averages_objects,
-    counts_objects,
-    declared_maximum,
-    depends_on_batch,
-)
+from rewards.base import RewardContext, RewardOutput, declared_maximum, facts_of
 from rewards.registry import as_output, is_own, resolve_reward, reward_name
 from scene_envs.errors import RewardError
 from scene_envs.protocols import SceneScorer
 from scene_envs.scene import SceneBatch
 
+logger = logging.getLogger(__name__)
+
 _local = threading.local()
+_warned: set[tuple[int, str]] = set()
+_MAX_WARNINGS = 256
+_MAX_TEXT = 300
+"""Number of characters of a foreign error that a message repeats."""
 
 
 @contextmanager
@@ -76,14 +75,6 @@ def other_draw(number: int) -> Iterator[None]:
 def current_draw() -> int:
     """Number of the stream of random numbers of this thread's rewards."""
     return int(getattr(_local, "draw", 0))
-
-
-logger = logging.getLogger(__name__)
-
-_warned: set[tuple[int, str]] = set()
-_MAX_WARNINGS = 256
-_MAX_TEXT = 300
-"""Number of characters of a foreign error that a message repeats."""
 
 
 def evaluate_reward(
@@ -130,8 +121,7 @@ def reward_scorer(reward: Any) -> SceneScorer:
         return evaluate_reward(resolved, batch, RewardContext(prompts=prompts, pool=pool))
 
     score.maximum = partial(declared_maximum, resolved)  # type: ignore[attr-defined]
-    for fact in (depends_on_batch, averages_objects, counts_objects):
-        setattr(score, fact.__name__, fact(resolved))
+    vars(score).update(facts_of(resolved))
     return score
 
 

@@ -1,4 +1,4 @@
-"""Reward: number of objects that are physically feasible as sampled."""
+"""Rewards by simulation: number or share of feasible objects, and their graded stillness."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from scene_envs.physics import FeasibilityResult, PhysicsPool
 
 
+_LIMITS = ("max_penetration", "max_displacement", "max_rotation", "duration")
 _MAX_VERDICTS = 4096
 """Number of scenes whose verdicts are kept, the latest ones."""
 
@@ -35,11 +36,7 @@ def verdicts(batch: SceneBatch, limits: dict[str, float], pool: PhysicsPool | No
 
     Scenes are recognised by their content: type, poses, categories and order of slots. A verdict depends only on its
     scene, bit for bit, so it may be kept. Verdicts of invalid scenes are not kept: a worker may only have been slow.
-
-    Args:
-        batch: B scenes of N slots.
-        limits: keyword arguments of ``feasibility``.
-        pool: worker processes; None computes in this process.
+    ``limits`` are keyword arguments of ``feasibility``.
     """
     from scene_envs.physics import FeasibilityResult, feasibility
 
@@ -80,9 +77,6 @@ def _keys(batch: SceneBatch, limits: dict[str, float]) -> list[bytes]:
     common = repr((batch.scene_type, models, sorted(limits.items()), tuple(batch.tensor.shape[1:]))).encode()
     scenes = batch.tensor.detach().cpu().contiguous().numpy()
     return [hashlib.blake2b(scene.tobytes() + common, digest_size=16).digest() for scene in scenes]
-
-
-_LIMITS = ("max_penetration", "max_displacement", "max_rotation", "duration")
 
 
 @register_reward("feasible_objects")
@@ -185,4 +179,64 @@ class FeasibleShare(FeasibleObjects):
             per_object=output.object_flags["feasible"].float() + (furniture & apart),
             terms=terms,
             object_flags=flags,
+        )
+
+
+@register_reward("stability")
+@dataclass(frozen=True)
+class Stability:
+    """Stillness of the free objects under gravity: their mean score, from 0 to 1 (at rest).
+
+    An object that moves by d and turns by a scores ``exp(-(d / scale + a / scale_rotation))``. Objects deeper than
+    ``max_penetration`` in others are removed before the simulation, as for ``feasible_objects``, and score 0. Objects
+    outside the workspace also score 0. A scene without free objects scores 0.
+
+    Attributes:
+        scale: movement that costs a factor of e, m.
+        scale_rotation: rotation that costs a factor of e, rad.
+        max_penetration: deepest overlap with which an object is simulated, m.
+        duration: simulated time, s.
+    """
+
+    name: ClassVar[str] = "stability"
+    maximum: ClassVar[float] = 1.0
+    averages_objects: ClassVar[bool] = True
+    scale: float = 0.01
+    scale_rotation: float = 0.1
+    max_penetration: float = 1e-3
+    duration: float = 0.1
+
+    def __post_init__(self) -> None:
+        for setting in ("scale", "scale_rotation", "max_penetration", "duration"):
+            if not getattr(self, setting) > 0:
+                raise InvalidInputError(f"stability: {setting}={getattr(self, setting)} must be positive")
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Simulate; rows that physics could not judge are invalid.
+
+        ``per_object`` (B, N) is the score of each object. Terms: ``free_objects``; ``simulated_objects``, those that
+        overlap nothing; ``moved_mm`` and ``turned_rad``, the means over these.
+        """
+        device = batch.tensor.device
+        limits = {
+            "max_penetration": self.max_penetration,
+            "max_displacement": 1e-3,
+            "max_rotation": 1e-2,
+            "duration": self.duration,
+        }  # as in feasible_objects: scenes that both rewards score are simulated once
+        result = verdicts(batch, limits, context.pool)
+        moved, turned = result.displacement.to(device), result.rotation.to(device)
+        simulated = batch.is_free & (result.depth.to(device) <= self.max_penetration)
+        score = torch.exp(-(moved / self.scale + turned / self.scale_rotation)) * (simulated & batch.in_workspace)
+        free, some = batch.is_free.sum(dim=-1).float(), simulated.sum(dim=-1).float()
+        return RewardOutput(
+            value=score.sum(dim=-1) / free.clamp(min=1),
+            per_object=score,
+            terms={
+                "free_objects": free,
+                "simulated_objects": some,
+                "moved_mm": 1e3 * (moved * simulated).sum(dim=-1) / some.clamp(min=1),
+                "turned_rad": (turned * simulated).sum(dim=-1) / some.clamp(min=1),
+            },
+            valid=result.valid.to(device),
         )

@@ -11,15 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from rewards.base import (
-    RewardContext,
-    RewardOutput,
-    averages_objects,
-    counts_objects,
-    declared_maximum,
-    depends_on_batch,
-    learned_parts,
-)
+from rewards.base import RewardContext, RewardOutput, declared_maximum, facts_of, learned_parts
 from rewards.evaluation import current_draw, describe_error, evaluate_reward, other_draw, seeded_generators
 from rewards.registry import (
     RewardInfo,
@@ -74,7 +66,6 @@ class IsolatedReward:
             raise InvalidInputError(f"only a reward given by name or as a mapping can be isolated, got {reward!r}")
         check_limits(timeout, memory)
         self.name = self.__name__ = reward_name(reward)
-        self.depends_on_batch = self.averages_objects = self.counts_objects = False
         self.seed = seed
         self.timeout, self.memory, self.workers = timeout, memory, workers
         self._reward = reward
@@ -131,8 +122,7 @@ class IsolatedReward:
             self._worker = _start(self.name, self.memory)
             try:
                 message = ("make", self._reward, allowed_targets(), allowed_files(), self.workers, self.seed)
-                facts: tuple[bool, bool, bool] = _answer(self._worker, self.name, message, self.timeout)
-                self.depends_on_batch, self.averages_objects, self.counts_objects = facts
+                vars(self).update(_answer(self._worker, self.name, message, self.timeout))
             except BaseException:
                 self.close()
                 raise
@@ -168,11 +158,7 @@ def _answer(worker: Process, name: str, message: Any = None, timeout: float = ST
 
 
 class RewardRunner:
-    """Answers of the process of a reward.
-
-    Args:
-        threads: number of threads of torch.
-    """
+    """Answers of the process of a reward, with a number of threads of torch."""
 
     def __init__(self, threads: int) -> None:
         torch.set_num_threads(threads)
@@ -195,11 +181,8 @@ class RewardRunner:
         except BaseException as error:
             raise RewardError(f"the reward raised {describe_error(error)}") from None
 
-    def make(self, reward: Any, targets: list[str], files: list[Any], workers: int, seed: int) -> tuple[bool, ...]:
-        """Make the reward, with generators seeded from the run's.
-
-        Returns whether it depends on the batch, averages objects and counts objects.
-        """
+    def make(self, reward: Any, targets: list[str], files: list[Any], workers: int, seed: int) -> dict[str, bool]:
+        """Make the reward, with generators seeded from the run's; returns its facts."""
         for target in targets:
             allow_reward_targets(target)
         for file in files:
@@ -212,7 +195,7 @@ class RewardRunner:
                 "parts of other packages and runs in a process of its own; combine it with this package's rewards alone"
             )
         self.pool = PhysicsPool(workers=workers) if workers else None
-        return depends_on_batch(self.reward), averages_objects(self.reward), counts_objects(self.reward)
+        return facts_of(self.reward)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares."""
@@ -243,30 +226,17 @@ class RewardRunner:
 
 
 class SeededReward:
-    """A reward of this process that is told the seed of its run.
-
-    Args:
-        reward: a name, mapping, function, class or reward.
-        seed: of the run.
-    """
+    """A reward of this process that gets the seed of its run in its context."""
 
     def __init__(self, reward: Any, seed: int) -> None:
         with seeded_generators(seed):
             self.reward = resolve_reward(reward)
-        self.name = reward_name(self.reward)
-        self.depends_on_batch = depends_on_batch(self.reward)
-        self.averages_objects = averages_objects(self.reward)
-        self.counts_objects = counts_objects(self.reward)
-        self.seed = seed
+        self.described_by, self.name, self.seed = self.reward, reward_name(self.reward), seed
+        vars(self).update(facts_of(self.reward))
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Score with the run's seed in the context."""
+        """Score with the seed of the run."""
         return evaluate_reward(self.reward, batch, replace(context, seed=self.seed), strict=True)
-
-    @property
-    def described_by(self) -> Any:
-        """What tells this reward from others: the reward itself."""
-        return self.reward
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
@@ -276,14 +246,7 @@ class SeededReward:
 def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: float = 1.0, workers: int = 0) -> Any:
     """A reward as runs use it: one of this package in this process, any other in a process that can be ended.
 
-    Functions and objects, which exist in this process alone, stay in it.
-
-    Args:
-        reward: whatever names a reward.
-        seed: of the run.
-        timeout: as for :class:`IsolatedReward`, like the arguments that follow.
-        memory: GiB.
-        workers: physics workers.
+    Functions and objects, which exist in this process alone, stay in it. Arguments as for :class:`IsolatedReward`.
 
     >>> run_reward("object_count")
     ObjectCount()
@@ -302,12 +265,7 @@ def describe_rewards(
     """Each name with its listing, or with the reason why the reward cannot be used.
 
     Rewards of installed packages are imported in another process. If one of them exits, crashes or hangs at its import,
-    the others are still listed.
-
-    Args:
-        names: registered names.
-        timeout: seconds that an import may take.
-        memory: GiB that an import may allocate.
+    the others are still listed. An import may take ``timeout`` seconds and ``memory`` GiB.
     """
     worker: Process | None = None
     try:

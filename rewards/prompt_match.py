@@ -41,11 +41,8 @@ class PromptMatch:
     """
 
     name: ClassVar[str] = "prompt_match"
+    maximum: ClassVar[float] = 1.0
     prompt: str | None = None
-
-    def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value: every claim holds."""
-        return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Compare every scene with its prompt.
@@ -81,11 +78,7 @@ def claims_asked(
 ) -> list[PromptFacts | None]:
     """Claims that a reward called ``name`` compares each scene with; None where a prompt is empty or cannot be read.
 
-    Args:
-        name: name of the reward in error messages.
-        prompt: one text for all scenes, used instead of ``prompts``.
-        batch: B scenes.
-        prompts: one text per scene.
+    ``prompt``, one text for all scenes, is used instead of ``prompts``.
 
     Raises:
         InvalidInputError: there is no prompt, there is not one per scene, or ``prompt`` cannot be read.
@@ -137,11 +130,8 @@ class Relation:
     """
 
     name: ClassVar[str] = "relation"
+    maximum: ClassVar[float] = 1.0
     prompt: str | None = None
-
-    def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value: every relation holds."""
-        return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Compare every scene with its prompt.

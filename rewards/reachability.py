@@ -38,6 +38,7 @@ class Reachability:
     """
 
     name: ClassVar[str] = "reachability"
+    maximum: ClassVar[float] = 1.0
     averages_objects: ClassVar[bool] = True
     sides: str | Sequence[str] = SIDES
     opening: float = 0.08
@@ -52,10 +53,6 @@ class Reachability:
             raise InvalidInputError(f"reachability: sides is empty; choose from {list(SIDES)}")
         object.__setattr__(self, "sides", sides)
         self._gripper()
-
-    def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value, if all objects are within reach."""
-        return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Try the gripper at each object. ``per_object`` (B, N) and the flag ``reachable`` mark the reached objects.

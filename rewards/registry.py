@@ -18,10 +18,20 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from rewards.base import Reward, RewardContext, RewardOutput, averages_objects, counts_objects, depends_on_batch
+from rewards.base import Reward, RewardContext, RewardOutput, facts_of
 from scene_envs.errors import InvalidInputError, RewardError
 from scene_envs.registry import PluginError, Registry, load_plugin
 from scene_envs.scene import SceneBatch
+
+ENTRY_POINT_GROUP = "scene_envs.rewards"
+"""Entry-point group under which packages register rewards; the entry's name is the reward's name."""
+
+Maker = TypeVar("Maker", bound=Callable[..., Any])
+
+_REWARDS: Registry[Callable[..., Any]] = Registry("reward", ENTRY_POINT_GROUP, read=lambda point: _of_plugin(point))
+_LOCAL = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)", re.DOTALL)
+_allowed: set[Path] = set()
+_allowed_targets: list[str] = ["rewards"]
 
 
 class FunctionReward:
@@ -42,8 +52,7 @@ class FunctionReward:
         self.name = str(name or getattr(function, "__name__", type(function).__name__))
         self.settings = settings
         self.maximum = getattr(function, "maximum", None)
-        self.depends_on_batch, self.averages_objects = depends_on_batch(function), averages_objects(function)
-        self.counts_objects = counts_objects(function)
+        vars(self).update(facts_of(function))
         self._takes_context = _accepts(function, 2, settings, self.name)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
@@ -78,10 +87,6 @@ def _accepts(function: Callable[..., Any], count: int, settings: Mapping[str, An
         f"reward {name!r} has the signature {signature} and was given the settings {sorted(settings)}; "
         "it must take (batch) or (batch, context), and its settings as keywords"
     )
-
-
-_LOCAL = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)", re.DOTALL)
-_allowed: set[Path] = set()
 
 
 def is_local(reward: Any) -> bool:
@@ -159,15 +164,6 @@ def load_local(reward: str) -> Callable[..., Any]:
     if not callable(found):
         raise InvalidInputError(f"reward {reward!r}: {str(path)!r} has no function or class {match['name']!r}")
     return found  # type: ignore[no-any-return]
-
-
-ENTRY_POINT_GROUP = "scene_envs.rewards"
-"""Entry-point group under which packages register rewards; the entry's name is the reward's name."""
-
-Maker = TypeVar("Maker", bound=Callable[..., Any])
-
-_REWARDS: Registry[Callable[..., Any]] = Registry("reward", ENTRY_POINT_GROUP, read=lambda point: _of_plugin(point))
-_allowed_targets: list[str] = ["rewards"]
 
 
 @dataclass(frozen=True)
@@ -272,7 +268,16 @@ def resolve_reward(reward: Any) -> Reward:
     if isinstance(reward, str):
         return make_reward(reward)
     if isinstance(reward, Mapping):
-        return _from_mapping({str(key): value for key, value in reward.items()})
+        settings = {str(key): value for key, value in reward.items()}
+        if "_target_" in settings:
+            target = settings.pop("_target_")
+            return _build(_find_target(target), target, settings)
+        if "name" not in settings:
+            raise InvalidInputError(
+                f"a reward mapping needs 'name' (or '_target_'), got keys {sorted(settings)}; "
+                "for example {'name': 'object_count'}"
+            )
+        return make_reward(settings.pop("name"), **settings)
     if not callable(reward):
         raise InvalidInputError(
             f"reward={reward!r} is neither a name, a mapping with 'name' or '_target_', nor a callable; "
@@ -337,9 +342,6 @@ def is_own(reward: Any) -> bool:
     return _within(str(module), {"rewards", "agents"})
 
 
-# -- looking up --------------------------------------------------------------------------------------
-
-
 def _find(name: str) -> Callable[..., Any]:
     return load_local(name) if name not in _REWARDS and is_local(name) else _REWARDS[name]
 
@@ -362,18 +364,6 @@ def _of_plugin(point: EntryPoint) -> Callable[..., Any]:
     return _REWARDS.get(name, loaded)
 
 
-def _from_mapping(settings: dict[str, Any]) -> Reward:
-    if "_target_" in settings:
-        target = settings.pop("_target_")
-        return _build(_find_target(target), target, settings)
-    if "name" not in settings:
-        raise InvalidInputError(
-            f"a reward mapping needs 'name' (or '_target_'), got keys {sorted(settings)}; "
-            "for example {'name': 'object_count'}"
-        )
-    return make_reward(settings.pop("name"), **settings)
-
-
 def _find_target(target: Any) -> Callable[..., Any]:
     """The class or function ``target`` names, if an allowed package itself defines it."""
     allowed = {*_allowed_targets, *(point.module.split(".")[0] for point in _REWARDS.points().values())}
@@ -394,9 +384,6 @@ def _find_target(target: Any) -> Callable[..., Any]:
 
 def _within(module: str, packages: set[str]) -> bool:
     return any(module == package or module.startswith(package + ".") for package in packages)
-
-
-# -- building ----------------------------------------------------------------------------------------
 
 
 def _build(maker: Callable[..., Any], name: str, settings: dict[str, Any]) -> Reward:

@@ -19,6 +19,9 @@ from torch.nn import functional as F
 
 from scene_envs.errors import InvalidInputError, unknown_name
 
+UNMASKINGS = ("systematic", "even", "independent")
+"""Ways to choose the masked slots that a step unmasks."""
+
 _TINY = 1e-30
 
 
@@ -127,8 +130,6 @@ class CategoricalProcess:
         """Whether a category is either unchanged or masked, so that a visible category is the clean one."""
         return not bool(_replaced(self.schedule.keep, self.schedule.mask).any())
 
-    # -- forward --------------------------------------------------------------------------------
-
     def rates(self, start: Tensor | int, end: Tensor | int) -> tuple[Tensor, Tensor]:
         """keep and mask probability of the stride ``start`` -> ``end`` (start < end), float64."""
         keep, mask = self.schedule.keep, self.schedule.mask
@@ -150,12 +151,9 @@ class CategoricalProcess:
 
     def marginal(self, x0: Tensor, t: Tensor) -> Tensor:
         """q(x_t | x_0) (..., K + 1) of data ``x0`` (...), int64, at timesteps ``t`` that broadcast against it."""
-        keep, mask = (rate[t.cpu()].to(x0.device) for rate in (self.schedule.keep, self.schedule.mask))
-        keep, mask = torch.broadcast_tensors(_fit(keep, x0), _fit(mask, x0))
-        spread = (_replaced(keep, mask) / self.categories).unsqueeze(-1)
-        kept = keep.unsqueeze(-1) * F.one_hot(x0, self.categories)
-        rows = [(kept + spread).expand(*x0.shape, self.categories), mask.expand(x0.shape)[..., None]]
-        return torch.cat(rows, dim=-1).float()
+        keep, mask = torch.broadcast_tensors(*self._rates_at(t, x0))
+        kept = keep * F.one_hot(x0, self.categories) + _replaced(keep, mask) / self.categories
+        return torch.cat([kept, mask.expand(*x0.shape, 1)], dim=-1).float()
 
     def add_noise(self, x0: Tensor, t: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """A sample of q(x_t | x_0), int64 like ``x0``."""
@@ -166,8 +164,6 @@ class CategoricalProcess:
         mask = self.schedule.mask[-1]
         spread = torch.full((self.categories,), float(1.0 - mask) / self.categories)
         return torch.cat([spread, mask.float().reshape(1)])
-
-    # -- reverse --------------------------------------------------------------------------------
 
     def posterior(self, x_t: Tensor, x0_probs: Tensor, t: Tensor | int, previous: Tensor | int) -> Tensor:
         """p(x_s | x_t) = sum over x_0 of q(x_s | x_t, x_0) p(x_0 | x_t) for a stride t -> s (Austin et al., Eq. 4).
@@ -188,7 +184,7 @@ class CategoricalProcess:
         keep_s, mask_s = self._rates_at(previous, x_t)
         keep_t, mask_t = self._rates_at(t, x_t)
         keep_ts, mask_ts = (
-            _fit(rate.to(x_t.device), x_t).unsqueeze(-1) for rate in self.rates(previous.cpu(), t.cpu())
+            fitted(rate.to(x_t.device), x_t).unsqueeze(-1) for rate in self.rates(previous.cpu(), t.cpu())
         )
         k, masked = self.categories, (x_t == self.categories).unsqueeze(-1)
         here = F.one_hot(x_t.clamp(max=k - 1), k).double()
@@ -204,13 +200,11 @@ class CategoricalProcess:
     def _rates_at(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Cumulative keep and mask at ``t``, shaped (B, ..., 1) for states ``like`` (B, ...)."""
         keep, mask = (rate[t.cpu()].to(like.device) for rate in (self.schedule.keep, self.schedule.mask))
-        return _fit(keep, like).unsqueeze(-1), _fit(mask, like).unsqueeze(-1)
+        return fitted(keep, like).unsqueeze(-1), fitted(mask, like).unsqueeze(-1)
 
     def log_prob(self, x_s: Tensor, probs: Tensor) -> Tensor:
         """(...) log-probability of the states ``x_s`` under ``probs`` (..., K + 1)."""
         return probs.gather(-1, x_s.unsqueeze(-1)).squeeze(-1).clamp(min=_TINY).log()
-
-    # -- training -------------------------------------------------------------------------------
 
     def loss(self, x0: Tensor, x_t: Tensor, t: Tensor, logits: Tensor, auxiliary: float = 5e-4) -> Tensor:
         """(B, ...) bound of one timestep: KL of the posteriors, or -log p(x_0) at t = 1, plus an auxiliary term.
@@ -227,17 +221,20 @@ class CategoricalProcess:
         truth = F.one_hot(x0, self.categories).to(logits.dtype)
         q, p = (self.posterior(x_t, probs, t, t - 1) for probs in (truth, log_x0.exp()))
         divergence = (q * (q.clamp(min=_TINY).log() - p.clamp(min=_TINY).log())).sum(dim=-1)
-        bound = torch.where(_fit(t.to(x0.device), x0) == 1, cross_entropy, divergence)
+        bound = torch.where(fitted(t.to(x0.device), x0) == 1, cross_entropy, divergence)
         return bound + auxiliary * cross_entropy
 
 
 def sample_categorical(probs: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """One index per row of ``probs`` (..., K), int64."""
-    flat = probs.reshape(-1, probs.shape[-1])
-    uniform = torch.rand(flat.shape[0], 1, generator=generator, device=flat.device, dtype=flat.dtype)
-    cumulative = flat.cumsum(dim=-1)
-    index = (cumulative < uniform * cumulative[:, -1:]).sum(dim=-1)
-    return index.clamp(max=probs.shape[-1] - 1).reshape(probs.shape[:-1])
+    uniform = torch.rand(probs.shape[:-1], generator=generator, device=probs.device, dtype=probs.dtype)
+    return inverted(probs.cumsum(dim=-1), uniform)
+
+
+def inverted(cumulative: Tensor, uniform: Tensor) -> Tensor:
+    """(...) int64: index of the running sum (..., S) of weights in which ``uniform`` (...) falls."""
+    below = cumulative < uniform.unsqueeze(-1) * cumulative[..., -1:]
+    return below.sum(dim=-1).clamp(max=cumulative.shape[-1] - 1)
 
 
 def _replaced(keep: Tensor, mask: Tensor) -> Tensor:
@@ -246,26 +243,18 @@ def _replaced(keep: Tensor, mask: Tensor) -> Tensor:
     return torch.where(rest > 1e-12, rest, torch.zeros_like(rest))
 
 
-def _fit(rate: Tensor, like: Tensor) -> Tensor:
+def fitted(rate: Tensor, like: Tensor) -> Tensor:
     """``rate`` (B,) or () with trailing dimensions to broadcast against ``like`` (B, ...)."""
     return rate.reshape(rate.shape + (1,) * (like.ndim - rate.ndim)) if rate.ndim else rate
-
-
-UNMASKINGS = ("systematic", "even", "independent")
-"""Ways to choose the masked slots that a step unmasks."""
 
 
 def draw_unmasked(masked: Tensor, chance: Tensor, uniform: Tensor) -> Tensor:
     """(B, N) bool: of the ``masked`` slots of each scene, those that are unmasked now, drawn without replacement.
 
-    Of M masked slots with chance p, M p rounded down or up are unmasked, up with the probability that makes M p the
-    mean. The ranks of independent numbers do not depend on their minimum. So one number per slot is enough: the
-    ranks choose the slots, and the minimum decides the rounding.
-
-    Args:
-        masked: (B, N) bool, the masked slots.
-        chance: (B, N) probability that a masked slot is unmasked, equal for all slots of a scene.
-        uniform: (B, N) independent numbers, uniform on [0, 1).
+    Every masked slot of a scene has the same ``chance`` (B, N). Of M masked slots with chance p, M p rounded down or up
+    are unmasked, up with the probability that makes M p the mean. The ranks of independent numbers do not depend on
+    their minimum. So one number per slot is enough: the ranks choose the slots, and the minimum decides the rounding.
+    These numbers ``uniform`` (B, N) are on [0, 1).
 
     >>> masked = torch.tensor([[True, True, False, True, True]])
     >>> draw_unmasked(masked, torch.full((1, 5), 0.5), torch.tensor([[0.4, 0.9, 0.0, 0.2, 0.6]])).tolist()
@@ -284,11 +273,8 @@ def systematic(unmasked: Tensor, uniform: Tensor) -> Tensor:
 
     Systematic sampling (Madow and Madow 1944): with k slots the numbers are (r + v) / k with the ranks r of ``uniform``
     among these slots and one v for all, the fractional part of their sum. Ranks and v are independent, so each number
-    is uniform. Slots of equal probabilities p take a category p k times, rounded down or up.
-
-    Args:
-        unmasked: (B, N) bool, the slots that a step unmasks.
-        uniform: (B, N) float64, independent and uniform on [0, 1); slots that are not unmasked keep theirs.
+    is uniform. Slots of equal probabilities p take a category p k times, rounded down or up. ``uniform`` (B, N) is
+    independent and uniform on [0, 1); slots that are not unmasked keep theirs.
 
     >>> unmasked = torch.tensor([[True, True, False, True, True]])
     >>> systematic(unmasked, torch.tensor([[0.75, 0.25, 0.5, 0.5, 0.125]])).tolist()
@@ -303,11 +289,8 @@ def systematic(unmasked: Tensor, uniform: Tensor) -> Tensor:
 def unmasking_log_prob(masked: Tensor, chance: Tensor, unmasked: Tensor) -> Tensor:
     """(B, N) nats, whose sum over a scene's slots is the log-probability that exactly ``unmasked`` are unmasked.
 
-    It depends on no parameter of a network; the masked slots of a scene have equal shares of it.
-
-    Args:
-        masked, chance: the arguments of :func:`draw_unmasked`.
-        unmasked: (B, N) bool, a subset of the masked slots.
+    It depends on no parameter of a network; the masked slots of a scene have equal shares of it. ``unmasked`` (B, N) is
+    a subset of the masked slots; the other arguments are those of :func:`draw_unmasked`.
 
     >>> masked, chance = torch.ones(1, 4, dtype=torch.bool), torch.full((1, 4), 0.5)
     >>> two = torch.tensor([[True, False, True, False]])

@@ -1,4 +1,4 @@
-"""The Gaussian diffusion process: forward noising, preconditioning, reverse posterior, training loss."""
+"""Gaussian diffusion: noise schedules, preconditioning, the process, step tables, and weights of the loss."""
 
 from __future__ import annotations
 
@@ -11,8 +11,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from agents.diffusion.categorical import CategoricalProcess
+from agents.diffusion.categorical import CategoricalProcess, fitted
 from scene_envs.errors import InvalidInputError, unknown_name
+
+PREDICTIONS = ("edm", "epsilon", "x0", "v")
+"""Targets that a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
+TIMESTEP_DISTRIBUTIONS = ("lognormal", "uniform", "both")
+"""Distributions of training timesteps: lognormal in the noise-to-signal ratio, uniform, or half of each."""
+LOSS_WEIGHTINGS = ("none", "min_snr")
+"""Weightings of the squared error by timestep; see :func:`loss_weights`."""
+MIN_SNR_GAMMA = 5.0
+"""Gamma of Hang et al. (2023), section 3.4: the largest signal-to-noise ratio in the weight."""
+
+Moments = tuple[Tensor, Tensor]
+"""Mean and standard deviation."""
 
 _MIN_SLOTS = 20
 """Smallest number of slots of a category from which its own moments are taken."""
@@ -99,8 +111,7 @@ class Preconditioning:
         """The moments as JSON."""
         state: dict[str, Any] = {"mean": self.mean.tolist(), "std": self.std.tolist()}
         if self.by_category is not None:
-            own = self.by_category
-            state["by_category"] = {"share": own.share.tolist(), "mean": own.mean.tolist(), "std": own.std.tolist()}
+            state["by_category"] = {name: moment.tolist() for name, moment in vars(self.by_category).items()}
         return state
 
     @classmethod
@@ -224,21 +235,8 @@ def make_schedule(
     return NoiseSchedule(name, _SCHEDULES[name](num_timesteps))
 
 
-Moments = tuple[Tensor, Tensor]
-"""Mean and standard deviation."""
-
-PREDICTIONS = ("edm", "epsilon", "x0", "v")
-"""Targets that a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
-
-
 def check_prediction(name: str) -> None:
-    """Raise when ``name`` is not a prediction.
-
-    Raises:
-        UnknownNameError: there is no such prediction.
-
-    >>> check_prediction("edm")
-    """
+    """Raise UnknownNameError unless ``name`` is one of :data:`PREDICTIONS`."""
     if name not in PREDICTIONS:
         raise unknown_name("prediction", name, PREDICTIONS)
 
@@ -262,14 +260,10 @@ class GaussianProcess:
         self.alpha = schedule.alpha_bar.sqrt().float()  # (T + 1,)
         self.sigma = (1.0 - schedule.alpha_bar).sqrt().float()  # (T + 1,)
 
-    # -- forward --------------------------------------------------------------------------------
-
     def rates(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """alpha_t and sigma_t, shaped to broadcast against ``like`` (B, N, D)."""
         alpha, sigma = self.alpha.to(like.device)[t], self.sigma.to(like.device)[t]
-        while alpha.ndim < like.ndim and alpha.ndim > 0:
-            alpha, sigma = alpha.unsqueeze(-1), sigma.unsqueeze(-1)
-        return alpha, sigma
+        return fitted(alpha, like), fitted(sigma, like)
 
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
         """A sample of q(x_t | x_0) (Ho et al. 2020, Eq. 4)."""
@@ -280,8 +274,6 @@ class GaussianProcess:
         """A sample of q(x_t | x_s), s < t: adds noise to go back from s to t."""
         ratio = self.schedule.alpha_bar[t] / self.schedule.alpha_bar[s]
         return float(ratio.sqrt()) * x_s + float((1.0 - ratio).sqrt()) * noise
-
-    # -- input and output of the network --------------------------------------------------------
 
     def network_input(self, x_t: Tensor, t: Tensor) -> Tensor:
         """x_t scaled to unit variance per feature for ``edm`` (Karras et al. 2022, c_in); x_t itself otherwise."""
@@ -327,8 +319,6 @@ class GaussianProcess:
         if self.prediction == "v":
             return alpha * noise - sigma * x0
         return x0
-
-    # -- reverse --------------------------------------------------------------------------------
 
     def check_stride(self, t: int, previous: int) -> None:
         """Raise InvalidInputError unless 0 <= s < t <= T."""
@@ -393,10 +383,6 @@ class GaussianProcess:
         if moments is not None:
             return moments
         return self.preconditioning.mean.to(like), self.preconditioning.std.to(like)
-
-
-TIMESTEP_DISTRIBUTIONS = ("lognormal", "uniform", "both")
-"""Distributions of training timesteps: lognormal in the noise-to-signal ratio, uniform, or half of each."""
 
 
 def timestep_weights(distribution: str, schedule: NoiseSchedule, mean: float, std: float) -> Tensor:
@@ -525,20 +511,8 @@ class StepTable:
         return cls(t, torch.cat([t[1:], torch.zeros(1, dtype=torch.int64)]))
 
 
-LOSS_WEIGHTINGS = ("none", "min_snr")
-"""Weightings of the squared error by timestep; see :func:`loss_weights`."""
-
-MIN_SNR_GAMMA = 5.0
-"""Gamma of Hang et al. (2023), section 3.4: the largest signal-to-noise ratio in the weight."""
-
-
 def check_weighting(kind: str, prediction: str) -> None:
-    """Raise when ``kind`` is not a weighting, or does not go with ``prediction``.
-
-    Raises:
-        UnknownNameError: a name is not known.
-        InvalidInputError: ``"min_snr"`` with ``"edm"`` prediction, whose target already weighs the levels.
-    """
+    """Raise UnknownNameError for an unknown name, InvalidInputError for ``"min_snr"`` with ``"edm"`` prediction."""
     if kind not in LOSS_WEIGHTINGS:
         raise unknown_name("loss weighting", kind, LOSS_WEIGHTINGS)
     check_prediction(prediction)
@@ -549,27 +523,17 @@ def check_weighting(kind: str, prediction: str) -> None:
         )
 
 
-def loss_weights(
-    schedule: NoiseSchedule, t: Tensor, prediction: str, kind: str, gamma: float = MIN_SNR_GAMMA
-) -> Tensor:
-    """(B,) float32 weights of the mean squares of the network's error at timesteps ``t``.
+def loss_weights(schedule: NoiseSchedule, t: Tensor, prediction: str, kind: str) -> Tensor:
+    """(B,) float32 weights of the mean squares of the network's error at timesteps ``t`` (B,), int64 in 1..T.
 
     ``"none"`` is 1 everywhere. ``"min_snr"`` (Hang et al. 2023, Eq. 8) gives the error of the clean scene the weight
-    min(SNR, gamma), SNR being alpha_t^2 / sigma_t^2. The squared error of the noise is SNR times that of the
-    clean scene, and the squared error of v is SNR + 1 times that of the clean scene. So their weights are
-    min(SNR, gamma) / SNR and min(SNR, gamma) / (SNR + 1).
-
-    Args:
-        schedule: noise schedule.
-        t: (B,) int64 in 1..T.
-        prediction: one of :data:`~agents.diffusion.gaussian.PREDICTIONS`.
-        kind: one of :data:`LOSS_WEIGHTINGS`.
-        gamma: largest signal-to-noise ratio in the weight.
+    min(SNR, gamma), with gamma :data:`MIN_SNR_GAMMA` and SNR being alpha_t^2 / sigma_t^2. The squared error of the
+    noise is SNR times that of the clean scene, and the squared error of v is SNR + 1 times that of the clean scene. So
+    their weights are min(SNR, gamma) / SNR and min(SNR, gamma) / (SNR + 1).
 
     Raises:
         UnknownNameError, InvalidInputError: the errors of :func:`check_weighting`.
 
-    >>> from agents.diffusion.gaussian import make_schedule
     >>> loss_weights(make_schedule("linear"), torch.tensor([1, 1000]), "x0", "min_snr").tolist()[0]
     5.0
     """
@@ -579,7 +543,7 @@ def loss_weights(
     alpha_bar = schedule.alpha_bar[t.cpu()]
     snr = alpha_bar / (1.0 - alpha_bar)
     over = {"epsilon": snr, "v": snr + 1.0, "x0": torch.ones_like(snr)}[prediction]
-    return (snr.clamp(max=gamma) / over).float().to(t.device)
+    return (snr.clamp(max=MIN_SNR_GAMMA) / over).float().to(t.device)
 
 
 def timestep_distribution(timesteps: str | None, prediction: str) -> str:

@@ -10,9 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from agents.diffusion.categorical import draw_unmasked, systematic, unmasking_log_prob
-
-_TINY = 1e-30
+from agents.diffusion.categorical import _TINY, draw_unmasked, inverted, systematic, unmasking_log_prob
 
 
 class ReverseStep(Protocol):
@@ -45,16 +43,9 @@ class ReverseStep(Protocol):
 
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """Log-density of independent normals, summed over features; entries with std 0 are left out.
+    """(B, N) log-density in nats of independent normals at ``x`` (B, N, D), summed over the features of each slot.
 
-    Args:
-        x: (B, N, D) where it is evaluated.
-        mean: (B, N, D).
-        std: (N, D), not negative. An entry with std 0 is certain: it carries no probability and no
-            gradient.
-
-    Returns:
-        (B, N) nats, one sum per slot.
+    ``mean`` is (B, N, D), ``std`` (N, D). An entry with std 0 is certain: it carries no probability and no gradient.
 
     >>> x, std = torch.zeros(1, 1, 2), torch.tensor([[1.0, 0.0]])
     >>> round(float(gaussian_log_prob(x, torch.zeros(1, 1, 2), std)), 4)
@@ -177,10 +168,10 @@ class MixedStep(NamedTuple):
         mask = self.probs.shape[-1] - 1
         cumulative = self.probs.double().cumsum(dim=-1)
         if self.masked is None:
-            return _invert(cumulative, uniform)
+            return inverted(cumulative, uniform)
         unmasked = draw_unmasked(self.masked, 1 - self.probs[..., -1], order)
         if self.groups is None:
-            chosen = _invert(cumulative[..., :-1], uniform)
+            chosen = inverted(cumulative[..., :-1], uniform)
         else:
             chosen = _draw_grouped(self.probs[..., :-1].double(), self.groups, systematic(unmasked, uniform), inner)
         states = torch.where(unmasked, chosen, torch.full_like(chosen, mask))
@@ -208,12 +199,6 @@ def _shifted(mean: Tensor, shift: Tensor) -> Tensor:
     return mean + F.pad(shift, (0, mean.shape[-1] - shift.shape[-1]))
 
 
-def _invert(cumulative: Tensor, uniform: Tensor) -> Tensor:
-    """(...) int64: index of the running sum (..., S) of weights in which ``uniform`` (...) falls."""
-    below = cumulative < uniform.unsqueeze(-1) * cumulative[..., -1:]
-    return below.sum(dim=-1).clamp(max=cumulative.shape[-1] - 1)
-
-
 def _draw_grouped(probs: Tensor, groups: Tensor, uniform: Tensor, inner: Tensor) -> Tensor:
     """(B, N) int64 categories, drawn with the weights ``probs`` (B, N, K).
 
@@ -222,8 +207,8 @@ def _draw_grouped(probs: Tensor, groups: Tensor, uniform: Tensor, inner: Tensor)
     order = groups.argsort(dim=-1, stable=True)[:, None].expand_as(probs)
     sorted_groups = groups[:, None].expand_as(probs).gather(2, order)
     weights = probs.gather(2, order)
-    group = sorted_groups.gather(2, _invert(weights.cumsum(dim=-1), uniform).unsqueeze(-1))
-    within = _invert((weights * (sorted_groups == group)).cumsum(dim=-1), inner)
+    group = sorted_groups.gather(2, inverted(weights.cumsum(dim=-1), uniform).unsqueeze(-1))
+    within = inverted((weights * (sorted_groups == group)).cumsum(dim=-1), inner)
     return order.gather(2, within.unsqueeze(-1)).squeeze(-1)
 
 

@@ -2,10 +2,16 @@
 
 from agents.evaluation.classifier import Accuracy, ClassifierConfig, classifier_accuracy
 from agents.evaluation.layouts import nearest_scenes, novelty, spacing_wasserstein, stack_wasserstein, tallest_stacks
-from agents.evaluation.measure import evaluate, figure_table, grammar_scenes, measure_samples
+from agents.evaluation.measure import (
+    evaluate,
+    figure_table,
+    grammar_scenes,
+    measure_samples,
+    own_prompts,
+    prompt_following,
+)
 from agents.evaluation.physics_figures import physics_figures, stable_fraction
 from agents.evaluation.pictures import frechet_inception_distance, frechet_scene_distance, render_classifier_accuracy
-from agents.evaluation.prompt_following import own_prompts, prompt_following
 
 __all__ = [
     "Accuracy",

@@ -10,12 +10,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.evaluation.set_network import SceneTokens, SetNetwork, TypicalPlaces, blurred, scene_tokens
+from agents.evaluation.set_network import SetNetwork, TypicalPlaces, blurred, scene_tokens
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch, check_same_assets
 
 MIN_SCENES = 20
 """Smallest number of scenes of each class with which a classifier is trained."""
+RESOLUTION = (1e-3, 1e-2)
+"""Standard deviation (m, rad) of the noise that is added to both classes: the largest motion of a feasible object."""
+MAX_OBJECTS = 50_000
+"""Largest number of objects to train on, both classes together; scenes of many objects cost more, and fewer suffice."""
 
 _STOP_LOSS = 5e-3
 """Validation loss (nats) below which training stops, because the classifier separates the classes."""
@@ -116,18 +120,10 @@ def check_classes(real: int, fake: int, seeds: int) -> None:
 def two_sample_accuracy(
     real: int, fake: int, prepare: Prepare, *, seeds: int, seed: int, config: ClassifierConfig
 ) -> Accuracy:
-    """Train and test one classifier per seed.
+    """Train and test one classifier per seed, which ``prepare`` makes, each with a split, weights and order of its own.
 
     Rows 0 … real - 1 are real scenes, the following ``fake`` rows are samples. The larger class is subsampled to the
     size of the smaller one.
-
-    Args:
-        real: number of real scenes.
-        fake: number of samples.
-        prepare: function that makes the classifier of a split.
-        seeds: number of repetitions, each with a split, weights and order of its own.
-        seed: seed of the first repetition.
-        config: settings of the training and test.
     """
     check_classes(real, fake, seeds)
     labels = torch.cat([torch.ones(real), torch.zeros(fake)])
@@ -184,13 +180,6 @@ def _logits(network: nn.Module, forward: Forward, rows: Tensor, config: Classifi
     return torch.cat([forward(network, part) for part in rows.split(4 * config.batch_size)])
 
 
-RESOLUTION = (1e-3, 1e-2)
-"""Standard deviation (m, rad) of the noise that is added to both classes: the largest motion of a feasible object."""
-
-MAX_OBJECTS = 50_000
-"""Largest number of objects to train on, both classes together; scenes of many objects cost more, and fewer suffice."""
-
-
 def classifier_accuracy(
     real: SceneBatch,
     fake: SceneBatch,
@@ -233,7 +222,6 @@ def classifier_accuracy(
     slots = max(real.tensor.shape[1], fake.tensor.shape[1])
     both = SceneBatch(torch.cat([real.with_slots(slots).tensor, fake.with_slots(slots).tensor]).cpu(), real.scene_type)
     tokens = scene_tokens(blurred(both, *resolution, generator) if max(resolution) else both)
-
     width = real.scene_type.num_assets + 1
 
     def prepare(split: Split) -> tuple[nn.Module, Forward]:
@@ -246,12 +234,8 @@ def classifier_accuracy(
 
         return network, forward
 
-    config = _with_fewer_scenes(config or ClassifierConfig(), tokens)
-    return two_sample_accuracy(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config)
-
-
-def _with_fewer_scenes(config: ClassifierConfig, tokens: SceneTokens) -> ClassifierConfig:
-    """``config`` with ``max_train`` lowered so that the training scenes hold about ``MAX_OBJECTS`` at most."""
+    config = config or ClassifierConfig()
     per_scene = float(tokens.present.sum()) / len(tokens)
     largest = max(MIN_SCENES, int(0.5 * MAX_OBJECTS / max(per_scene, 1.0)))
-    return replace(config, max_train=min(config.max_train, largest))
+    config = replace(config, max_train=min(config.max_train, largest))
+    return two_sample_accuracy(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config)

@@ -1,10 +1,10 @@
-"""Spacing of objects: distances between neighbours, compared with real scenes."""
+"""Layout figures, which need no simulator: counts, categories, heights, spacing, stacks, nearest scenes."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +29,19 @@ MAX_DISTANCE = 0.5
 """Bound of a distance (m), so that places on other tables of a room do not outweigh neighbours."""
 MIN_DISTANCES = 30
 """Smallest number of distances of a pair of assets, in each of the two batches; rarer pairs are left out."""
+KL_EPS = 1e-6
+"""Probability added to every category before renormalising, so that the KL is finite if a category is never sampled."""
+DUPLICATE = 0.01
+"""Largest distance (m) between objects that count as at the same place."""
+CANDIDATES = 32
+"""Number of scenes, the nearest by their features, to which the exact distance is computed."""
 
 _CHUNK = 128
+"""Scenes whose pairs of objects are in memory together."""
+_ROWS = 256
+"""Number of scenes whose features are compared with all others at once."""
+_WAVES = 12
+"""Number of test functions of the position, for each asset."""
 
 
 def spacing_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float | None:
@@ -82,17 +93,6 @@ def _distances(batch: SceneBatch) -> Mapping[tuple[int, int], np.ndarray[tuple[i
                 values = nearest[there & (categories == asset)].clamp(max=MAX_DISTANCE)
                 found[asset, other].append(values.numpy())
     return {pair: np.concatenate(parts) for pair, parts in found.items()}
-
-
-DUPLICATE = 0.01
-"""Largest distance (m) between objects that count as at the same place."""
-CANDIDATES = 32
-"""Number of scenes, the nearest by their features, to which the exact distance is computed."""
-
-_ROWS = 256
-"""Number of scenes whose features are compared with all others at once."""
-_WAVES = 12
-"""Number of test functions of the position, for each asset."""
 
 
 @dataclass(frozen=True)
@@ -190,16 +190,13 @@ def _is_copy(first: PlacedObjects, second: PlacedObjects) -> bool:
 
 
 def _close_pairs(positions: list[Array]) -> Index:
-    """(P, 2): pairs of scenes whose centres are near enough for them to be copies; all are of the same assets."""
+    """(P, 2): pairs of scenes of the same assets whose centres are near enough for them to be copies."""
     from scipy.spatial import KDTree
 
     if len(positions) < 2:
         return np.empty((0, 2), dtype=np.int64)
     centers = np.stack([scene.mean(axis=0) if len(scene) else np.zeros(3) for scene in positions])
     return KDTree(centers).query_pairs(DUPLICATE * 1.001, output_type="ndarray")
-
-
-# -- features --------------------------------------------------------------------------------------
 
 
 def _features(batch: SceneBatch, limit: float) -> Tensor:
@@ -379,3 +376,131 @@ CONTAINERS: tuple[Container, ...] = (
     Container(("utensil_crock",), _UTENSILS, reach=0.10, depth=0.20),
 )
 """Containers of all scene types."""
+
+
+def category_distribution(batch: SceneBatch, eps: float = KL_EPS) -> Tensor:
+    """Share of every asset among the objects of all scenes (welded ones included, empty slots ignored).
+
+    Returns:
+        (C,) float64, positive and summing to 1: ``eps`` is added to each share before renormalising.
+    """
+    assets = batch.scene_type.num_assets
+    counts = torch.bincount(batch.categories.flatten().cpu(), minlength=assets + 1)[:assets].double()
+    if not counts.sum():
+        raise InvalidInputError(f"a batch of {len(batch)} scenes without any object has no category distribution")
+    shares = counts / counts.sum() + eps
+    return shares / shares.sum()
+
+
+def category_kl(batch: SceneBatch, reference: SceneBatch) -> float:
+    """KL(reference ‖ samples) of the category distributions, nats; 0 when they agree.
+
+    The paper's category KL (section 4): it punishes assets that the samples lack.
+
+    >>> category_kl(SceneBatch.empty("dimsum_table", 3), SceneBatch.empty("dimsum_table", 5))
+    0.0
+    """
+    check_same_assets(batch, reference)
+    p, q = category_distribution(reference), category_distribution(batch)
+    return float((p * (p / q).log()).sum())
+
+
+def count_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
+    """Wasserstein-1 distance of the distributions of objects per scene, in objects."""
+    from scipy.stats import wasserstein_distance
+
+    check_same_assets(batch, reference)
+    return float(wasserstein_distance(batch.counts.cpu().numpy(), reference.counts.cpu().numpy()))
+
+
+def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) -> dict[str, Tensor]:
+    """Distance in height between objects and the support nearest to each in height.
+
+    A surface fixed in the world is always a candidate. A support on another object is a candidate for the objects
+    within ``reach`` of it horizontally; where the top of the supporting object is above its frame, they must also be
+    above that frame. An object is counted under the kind of the candidate that is nearest to its own z. The error is
+    how far the object floats above, or is sunk into, the support that it seems to rest on. Objects that lie in a
+    container, see :data:`~agents.evaluation.layouts.CONTAINERS`, are left out.
+
+    Args:
+        batch: scenes to measure.
+        supports: surfaces on which objects may rest; None takes those of the scene type.
+
+    Returns:
+        For each kind, a (K,) float tensor of absolute errors in m; K is the number of objects of that kind.
+    """
+    if supports is None:
+        supports = SUPPORTS.get(batch.scene_type.name, ())
+    if not supports:
+        return {}
+    errors: dict[str, list[Tensor]] = {support.kind: [] for support in supports}
+    for start in range(0, len(batch), _CHUNK):
+        for kind, error in _chunk_errors(batch[start : start + _CHUNK], supports):
+            errors[kind].append(error)
+    return {kind: torch.cat(parts) if parts else torch.empty(0) for kind, parts in errors.items()}
+
+
+def workspace_fraction(batch: SceneBatch) -> float:
+    """Share of the objects whose frame lies in the workspace, welded ones included."""
+    present = int(batch.counts.sum())
+    if not present:
+        raise InvalidInputError(f"a batch of {len(batch)} scenes without any object has no workspace fraction")
+    return int(batch.in_workspace.sum()) / present
+
+
+def out_of_workspace_rate(batch: SceneBatch) -> float:
+    """Share of the free objects whose frame is outside the workspace; 0 where there are none."""
+    free = batch.is_free
+    return int((free & ~batch.in_workspace).sum()) / max(int(free.sum()), 1)
+
+
+def _chunk_errors(batch: SceneBatch, supports: Sequence[Support]) -> list[tuple[str, Tensor]]:
+    gaps = torch.stack([_height_gap(batch, support) for support in supports])  # (S, B, N)
+    catch = torch.tensor([support.catch for support in supports]).to(gaps)[:, None, None]
+    nearest = (gaps - 1.0 * ((gaps <= catch) & (catch > 0))).argmin(dim=0)
+    error = gaps.gather(0, nearest[None])[0]
+    supported = torch.isfinite(error) & ~_contained(batch)
+    return [(support.kind, error[supported & (nearest == index)]) for index, support in enumerate(supports)]
+
+
+def _height_gap(batch: SceneBatch, support: Support) -> Tensor:
+    """(B, N) m: |z - height of the nearest such support|, infinite where there is none."""
+    z = batch.translations[..., 2].double()
+    if support.on is None:
+        gap = (z - support.height).abs()
+    else:
+        rise = z.unsqueeze(2) - z.unsqueeze(1)  # (B, rider, supporter)
+        carries = _near(batch, support.on, support.reach)
+        if support.height > 0:
+            carries &= rise > 0
+        gap = (rise - support.height).abs().masked_fill(~carries, torch.inf).amin(dim=-1)
+    riders = batch.is_free if support.riders is None else _is_one_of(batch, support.riders)
+    return gap.masked_fill(~riders, torch.inf)
+
+
+def _near(batch: SceneBatch, names: Sequence[str], reach: float) -> Tensor:
+    """(B, N, N) bool at [b, i, j]: object j is not i, is one of the assets ``names``, and is within ``reach`` of i."""
+    xy = batch.translations[..., :2].double()
+    near = (xy.unsqueeze(2) - xy.unsqueeze(1)).norm(dim=-1) <= reach
+    near.diagonal(dim1=1, dim2=2).fill_(False)
+    return near & _is_one_of(batch, names).unsqueeze(1)
+
+
+def _contained(batch: SceneBatch) -> Tensor:
+    """(B, N) bool: the object lies in a container."""
+    z = batch.translations[..., 2].double()
+    rise = z.unsqueeze(2) - z.unsqueeze(1)  # (B, rider, container)
+    inside = torch.zeros_like(batch.is_empty)
+    for container in CONTAINERS:
+        if not set(container.names) & set(batch.scene_type.assets):
+            continue
+        held = _near(batch, container.names, container.reach) & (rise > 0.01) & (rise <= container.depth)
+        inside |= held.any(dim=-1) & _is_one_of(batch, container.riders)
+    return inside
+
+
+def _is_one_of(batch: SceneBatch, names: Sequence[str]) -> Tensor:
+    """(B, N) bool: the slot holds one of the assets ``names``."""
+    assets = batch.scene_type.assets
+    wanted = [assets.index(name) for name in names if name in assets]
+    return torch.isin(batch.categories, torch.tensor(wanted, device=batch.tensor.device))

@@ -1,4 +1,4 @@
-"""Evaluation of scenes: a flat dict of figures for model cards, reports and the command line."""
+"""Evaluation of scenes, and of how they follow prompts: a flat dict of figures for cards, reports and commands."""
 
 from __future__ import annotations
 
@@ -13,24 +13,27 @@ import torch
 from torch import Tensor
 
 from agents.configuration.composition import MEASURE_NAMES
+from agents.evaluation.classifier import Accuracy, classifier_accuracy
 from agents.evaluation.layouts import (
     Neighbors,
+    category_kl,
+    count_wasserstein,
     duplicates,
+    height_errors,
     nearest_scenes,
     novelty,
+    out_of_workspace_rate,
     spacing_wasserstein,
     stack_wasserstein,
     tallest_stacks,
-)
-from agents.evaluation.metrics import (
-    category_kl,
-    count_wasserstein,
-    height_errors,
-    out_of_workspace_rate,
     workspace_fraction,
 )
 from agents.evaluation.physics_figures import physics_figures, ready_figures
-from agents.evaluation.prompt_following import CHANCE_PREFIX, own_prompts, prompt_chance, prompt_following
+from agents.evaluation.pictures import (
+    frechet_inception_distance,
+    frechet_scene_distance,
+    render_classifier_accuracy,
+)
 from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import SceneBatch
@@ -39,9 +42,20 @@ from scene_envs.scene_types import SceneType
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
 
+from collections.abc import Sequence
+
+from scene_envs.datasets.prompts import KINDS, PromptFacts, describe, parse_prompt, scene_facts
+from scene_envs.datasets.prompts.claims import NameCount, ObjectCount
 
 FLOOR_PREFIX = "floor_"
 """Prefix of the figures of real scenes measured against other real scenes."""
+CHANCE_PREFIX = "chance_"
+"""Prefix of the figures of real scenes measured against prompts of other real scenes."""
+_PROMPT_FIGURES = {"count": "prompt_counts", "names": "prompt_names", "relations": "prompt_relations"}
+_FLOOR_SEED = 1_000_003
+"""Added to the seed of the grammar for the second set of scenes."""
+
+Figures = dict[str, float]
 
 
 class Sampler(Protocol):
@@ -174,10 +188,6 @@ def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]
     return figures
 
 
-_FLOOR_SEED = 1_000_003
-"""Added to the seed of the grammar for the second set of scenes."""
-
-
 @dataclass(frozen=True)
 class RealScenes:
     """Disjoint sets of real scenes.
@@ -251,6 +261,8 @@ def _split(
     folder: str, heldout: str, scene_type: SceneType, count: int, training: int, seed: int
 ) -> tuple[SceneBatch, SceneBatch, SceneBatch]:
     """Reference, floor and training scenes of one folder; no scene is in two of them."""
+    from scene_envs.datasets.dataset import scene_keys
+
     whole = _read(folder, scene_type)
     if heldout:
         held, train = _distinct(_read(heldout, scene_type)), whole
@@ -263,7 +275,7 @@ def _split(
             f"{heldout or folder!r} has {len(held)} distinct held-out scenes; at least 4 are needed, half of them for "
             "the real-against-real floor: generate more, or name a folder with more as heldout="
         )
-    train = train[~np.isin(_keys(train), _keys(held))]
+    train = train[~np.isin(scene_keys(train), scene_keys(held))]
     if not len(train):
         raise InvalidInputError(
             f"all scenes of data={folder!r} are held-out scenes too; novelty has nothing to compare"
@@ -276,8 +288,7 @@ def _split(
 def _in_turn(parts: list[SceneBatch]) -> SceneBatch:
     """The scenes of all parts, in turn, so that any first scenes are from all parts."""
     numbers = torch.cat([torch.arange(len(part)) for part in parts])
-    whole = SceneBatch.concatenate(parts)
-    return whole[numbers.argsort(stable=True)]
+    return SceneBatch.concatenate(parts)[numbers.argsort(stable=True)]
 
 
 def _read(folder: str, scene_type: SceneType) -> Tensor:
@@ -298,21 +309,14 @@ def _read(folder: str, scene_type: SceneType) -> Tensor:
 
 
 def _distinct(tensor: Tensor) -> Tensor:
-    _, first = np.unique(_keys(tensor), return_index=True)
-    return tensor[torch.from_numpy(np.sort(first))]
-
-
-def _keys(tensor: Tensor) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
     from scene_envs.datasets.dataset import scene_keys
 
-    return scene_keys(tensor)
+    _, first = np.unique(scene_keys(tensor), return_index=True)
+    return tensor[torch.from_numpy(np.sort(first))]
 
 
 def _folders(text: str) -> list[str]:
     return [folder.strip() for folder in text.split(",") if folder.strip()]
-
-
-Figures = dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -361,40 +365,17 @@ def _with_floor(measure: Callable[[SceneBatch], Figures], inputs: EvaluationInpu
     return {**measure(inputs.samples), **real}
 
 
-def _classifier(inputs: EvaluationInputs) -> Figures:
-    from agents.evaluation.classifier import classifier_accuracy
-
+def _accuracy(name: str, classify: Callable[..., Accuracy], inputs: EvaluationInputs) -> Figures:
     def measure(batch: SceneBatch) -> Figures:
-        accuracy = classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
-        return {"classifier_accuracy": accuracy.mean, "classifier_accuracy_std": accuracy.std}
+        accuracy = classify(inputs.real.reference, batch, seed=inputs.seed)
+        return {name: accuracy.mean, f"{name}_std": accuracy.std}
 
     return _with_floor(measure, inputs)
-
-
-def _renders(inputs: EvaluationInputs) -> Figures:
-    from agents.evaluation.pictures import render_classifier_accuracy
-
-    def measure(batch: SceneBatch) -> Figures:
-        accuracy = render_classifier_accuracy(inputs.real.reference, batch, seed=inputs.seed)
-        return {"render_accuracy": accuracy.mean, "render_accuracy_std": accuracy.std}
-
-    return _with_floor(measure, inputs)
-
-
-def _fsd(inputs: EvaluationInputs) -> Figures:
-    from agents.evaluation.pictures import frechet_scene_distance
-
-    return _with_floor(
-        lambda batch: {"frechet_scene_distance": frechet_scene_distance(batch, inputs.real.reference)}, inputs
-    )
 
 
 def _fid(inputs: EvaluationInputs) -> Figures:
-    from agents.evaluation.pictures import frechet_inception_distance
-
     if not inputs.fid_weights:
         raise InvalidInputError("FID needs fid_weights=, the path of an Inception-v3's weights")
-
     real, weights = inputs.real.reference, inputs.fid_weights
     return _with_floor(
         lambda batch: {"frechet_inception_distance": frechet_inception_distance(batch, real, weights)}, inputs
@@ -431,17 +412,18 @@ MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
     "layout": lambda inputs: _with_floor(lambda batch: layout_figures(batch, inputs.real.reference), inputs),
     "physics": lambda inputs: _with_floor(lambda batch: physics_figures(batch, inputs.pool), inputs),
     "ready": lambda inputs: _with_floor(lambda batch: ready_figures(batch, inputs.pool), inputs),
-    "fsd": _fsd,
+    "fsd": lambda inputs: _with_floor(
+        lambda batch: {"frechet_scene_distance": frechet_scene_distance(batch, inputs.real.reference)}, inputs
+    ),
     "novelty": _novelty,
     "prompts": _prompts,
-    "classifier": _classifier,
-    "renders": _renders,
+    "classifier": lambda inputs: _accuracy("classifier_accuracy", classifier_accuracy, inputs),
+    "renders": lambda inputs: _accuracy("render_accuracy", render_classifier_accuracy, inputs),
     "fid": _fid,
 }
 """Groups of measures, in the order in which they are computed: cheap ones first."""
 
 
-_HEADS = ("figure", "samples", "real", "how to read")
 _NOT_SHOWN = frozenset({"category_kl"})
 """Figures that the table leaves out, because they are shown under another name, in units of 1e-4."""
 
@@ -508,7 +490,7 @@ def figure_table(figures: Mapping[str, float]) -> str:
     |---|---|---|---|
     | objects_mean | 18 | 18.25 | objects per scene, welded ones included |
     """
-    lines = ["| " + " | ".join(_HEADS) + " |", "|---" * len(_HEADS) + "|"]
+    lines = ["| figure | samples | real | how to read |", "|---|---|---|---|"]
     for name, value in figures.items():
         if name.startswith(FLOOR_PREFIX) or name in _NOT_SHOWN:
             continue
@@ -536,3 +518,80 @@ def _number(value: float | None) -> str:
     if value is None:
         return ""
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
+
+
+def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, float]:
+    """Share of scenes that follow their own prompt.
+
+    This is the paper's prompt-following accuracy. A prompt is followed if every claim in it is true of the scene. The
+    numbers of the named objects must be exact. Relations have the tolerances in docs/prompts.md.
+
+    Args:
+        batch: B scenes.
+        prompts: B prompts that :func:`~scene_envs.datasets.parse_prompt` reads.
+
+    Returns:
+        ``prompt_following``: share of all prompts followed. ``prompt_counts``, ``prompt_names`` and
+        ``prompt_relations``: the same among prompts of that kind, where there are any. ``prompt_counts_number`` and
+        so on: the number of prompts of that kind. ``prompt_score``: mean partial credit in [0, 1], 1 only when every
+        prompt is followed.
+
+    Raises:
+        InvalidInputError: there is not one prompt per scene, or a prompt cannot be read.
+
+    >>> scenes = SceneBatch.empty("dimsum_table", 2)
+    >>> figures = prompt_following(scenes, ["A scene with 1 object.", "A scene with a teapot."])
+    >>> figures["prompt_following"], figures["prompt_counts"], figures["prompt_names"]
+    (0.5, 1.0, 0.0)
+    """
+    if len(prompts) != len(batch) or not prompts:
+        raise InvalidInputError(f"{len(prompts)} prompts for {len(batch)} scenes; give one prompt per scene")
+    asked = [parse_prompt(prompt, batch.scene_type) for prompt in prompts]
+    followed: dict[str, list[bool]] = {kind: [] for kind in KINDS}
+    scores = []
+    for prompt, scene in zip(asked, scene_facts(batch), strict=True):
+        checks = prompt.check(scene)
+        followed[kind_of(prompt)].append(all(check.holds for check in checks))
+        scores.append(np.mean([check.score for check in checks]))
+    figures = {"prompt_following": float(np.mean([holds for kind in followed.values() for holds in kind]))}
+    for kind, holds in followed.items():
+        if holds:
+            name = _PROMPT_FIGURES[kind]
+            figures |= {name: float(np.mean(holds)), f"{name}_number": float(len(holds))}
+    return {**figures, "prompt_score": float(np.mean(scores))}
+
+
+def prompt_chance(batch: SceneBatch, prompts: Sequence[str], seed: int = 0) -> dict[str, float]:
+    """Shares of :func:`prompt_following` by chance, ``chance_<name>``: each scene has the prompt of another.
+
+    Raises:
+        InvalidInputError: there are fewer than two scenes.
+    """
+    if len(batch) < 2:
+        raise InvalidInputError(f"chance needs at least 2 scenes to exchange prompts, got {len(batch)}")
+    order = np.random.default_rng(seed).permutation(len(prompts))
+    others = np.empty_like(order)
+    others[order] = np.roll(order, 1)  # one cycle: no scene keeps its own prompt
+    figures = prompt_following(batch, [prompts[i] for i in others])
+    return {CHANCE_PREFIX + name: value for name, value in figures.items() if not name.endswith("_number")}
+
+
+def own_prompts(batch: SceneBatch, seed: int = 0) -> list[str]:
+    """One prompt per scene that is true of it; counts, names and relations take turns.
+
+    A scene that has no relations to describe gets a prompt on its number of objects.
+
+    >>> own_prompts(SceneBatch.empty("dimsum_table", 1))
+    ['A scene with 1 object.']
+    """
+    rng = np.random.default_rng(seed)
+    prompts = [""] * len(batch)
+    for turn, kind in enumerate(KINDS[: len(batch)]):
+        prompts[turn :: len(KINDS)] = describe(batch[turn :: len(KINDS)], rng, kinds=[kind])
+    return prompts
+
+
+def kind_of(prompt: PromptFacts) -> str:
+    """Kind of a prompt, one of :data:`~scene_envs.datasets.prompts.KINDS`."""
+    first = prompt.claims[0]
+    return "count" if isinstance(first, ObjectCount) else "names" if isinstance(first, NameCount) else "relations"

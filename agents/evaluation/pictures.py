@@ -1,11 +1,11 @@
-"""Fréchet Inception distance of renders, for users who have the weights of an Inception-v3."""
+"""Fréchet distances of scenes and of their renders, and a classifier of renders."""
 
 from __future__ import annotations
 
 import os
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,12 +14,18 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.evaluation.classifier import Accuracy, ClassifierConfig, Forward, Split, check_classes, two_sample_accuracy
+from agents.evaluation.set_network import SetEncoder
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 from scene_envs.files import read_tensors
 from scene_envs.scene import SceneBatch, check_same_assets
 
-if TYPE_CHECKING:
-    from agents.evaluation.set_encoder import SetEncoder
+WIDTH, HEIGHT = 96, 72
+"""Default size of the renders of the classifier, pixels."""
+
+_SIDE = 299
+_FID_CLASSES = 1008
+"""Classes of the TensorFlow network of 2015, with which FIDs are computed; torchvision's own network has 1000."""
+_COLOR_FEATURES = 6
 
 
 def frechet_scene_distance(a: SceneBatch, b: SceneBatch, *, encoder: SetEncoder | None = None) -> float:
@@ -40,8 +46,6 @@ def frechet_scene_distance(a: SceneBatch, b: SceneBatch, *, encoder: SetEncoder 
     Raises:
         InvalidInputError: a batch has fewer than two scenes.
     """
-    from agents.evaluation.set_encoder import SetEncoder
-
     _check_count(len(a), len(b))
     encoder = SetEncoder.load() if encoder is None else encoder
     return feature_distance(encoder.features(a).numpy(), encoder.features(b).numpy())
@@ -62,13 +66,7 @@ def gaussian_distance(mean_a: ArrayLike, cov_a: ArrayLike, mean_b: ArrayLike, co
     """Squared 2-Wasserstein distance of two Gaussians (Dowson and Landau 1982).
 
     ``|m_a - m_b|² + tr(S_a + S_b - 2 (S_a^½ S_b S_a^½)^½)``, by symmetric eigendecompositions, which also work for
-    singular covariances.
-
-    Args:
-        mean_a: (F,) mean of the first Gaussian.
-        cov_a: (F, F) covariance of the first Gaussian, symmetric and positive semi-definite.
-        mean_b: (F,) mean of the second Gaussian.
-        cov_b: (F, F) covariance of the second Gaussian.
+    singular covariances (F, F); means are (F,).
 
     >>> gaussian_distance([0.0], [[1.0]], [3.0], [[4.0]])
     10.0
@@ -85,11 +83,6 @@ def gaussian_distance(mean_a: ArrayLike, cov_a: ArrayLike, mean_b: ArrayLike, co
 def _check_count(first: int, second: int) -> None:
     if min(first, second) < 2:
         raise InvalidInputError(f"a Fréchet distance needs at least two scenes on both sides, got {first} and {second}")
-
-
-_SIDE = 299
-_FID_CLASSES = 1008
-"""Classes of the TensorFlow network of 2015, with which FIDs are computed; torchvision's own network has 1000."""
 
 
 def frechet_inception_distance(
@@ -124,8 +117,7 @@ def frechet_inception_distance(
         CorruptFileError: the file is not a state dict of such a network.
     """
     network = load_inception(weights)
-    features = [_features(network, batch, width, height, batch_size) for batch in (a, b)]
-    return feature_distance(*features)
+    return feature_distance(*(_features(network, batch, width, height, batch_size) for batch in (a, b)))
 
 
 def load_inception(weights: str | os.PathLike[str]) -> nn.Module:
@@ -208,12 +200,6 @@ def _features(network: nn.Module, batch: SceneBatch, width: int, height: int, ba
     return np.concatenate(parts) if parts else np.empty((0, 2048))
 
 
-WIDTH, HEIGHT = 96, 72
-"""Default size of the renders, pixels."""
-
-_COLOR_FEATURES = 6
-
-
 def render_classifier_accuracy(
     real: SceneBatch,
     fake: SceneBatch,
@@ -264,16 +250,7 @@ def render_classifier_accuracy(
 
 
 def class_images(batches: list[SceneBatch], width: int, height: int) -> tuple[Tensor, int]:
-    """Semantic renders as class indices.
-
-    Args:
-        batches: scenes of one type.
-        width: width of the renders in pixels.
-        height: height of the renders in pixels.
-
-    Returns:
-        (B, H, W) uint8 indices of the colours of all renders, and the number of colours.
-    """
+    """(B, H, W) uint8 indices of the colours of the semantic renders of all scenes, and the number of colours."""
     from scene_envs.render import render
 
     images = np.concatenate([render(b, style="semantic", width=width, height=height) for b in batches])

@@ -1,16 +1,22 @@
-"""A small set transformer over the objects of a scene."""
+"""Set transformers over the objects of a scene: tokens, networks, and the frozen encoder of Fréchet distances."""
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import dataclass, fields
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.files import read_tensors, write_tensors
 from scene_envs.rotations import quaternion_to_matrix
 from scene_envs.scene import POSE_FEATURES, SceneBatch
 
@@ -20,7 +26,13 @@ NEIGHBOUR_FEATURES = 7
 """Numbers per neighbour: offset (3), gap per axis (3), gap of the horizontal outlines."""
 WAVE_FEATURES = 26
 """Numbers of the Fourier features of a translation."""
+FEATURES = 64
+"""Features of a scene that a :class:`SetEncoder` gives."""
+SHIPPED = Path(__file__).parent / "weights" / "set_encoder.safetensors"
+"""File of the encoder that :func:`~agents.evaluation.pictures.frechet_scene_distance` uses."""
 
+_OWN = 12 + WAVE_FEATURES + 3
+"""Features of an object that a :class:`SetEncoder` reads."""
 _HORIZONTAL_WAVES = (16.0, 4.0, 1.0)
 _VERTICAL_WAVES = (2.56, 1.28, 0.64, 0.32, 0.16, 0.08, 0.04)
 """Wavelengths (m) of the Fourier features of x and y, and of z; those of z are finer: heights are few and exact."""
@@ -31,6 +43,10 @@ _TIE_BREAK = (7.1e-5, 5.3e-5, 3.1e-5)
 choose between them."""
 _FAR = 1e6
 _CHUNK = 256
+_PRIOR_COUNT = 4.0
+"""Weight, in objects, of the variance over all groups in the variance of one group."""
+_CLIP = 8.0
+_MIN_STD = 1e-4
 
 
 @dataclass(frozen=True)
@@ -92,13 +108,9 @@ def scene_tokens(batch: SceneBatch, neighbours: int = NEIGHBOURS) -> SceneTokens
 def blurred(
     batch: SceneBatch, translation: float | Tensor, rotation: float | Tensor, generator: torch.Generator
 ) -> SceneBatch:
-    """The scenes with Gaussian noise on all poses.
+    """The scenes with Gaussian noise on all poses, of standard deviation ``translation`` (m) and ``rotation`` (rad).
 
-    Args:
-        batch: the scenes.
-        translation: standard deviation per axis, m; a number, or a tensor that broadcasts to (B, N, 3).
-        rotation: standard deviation of the rotation vector per axis, rad; a number, or a tensor like ``translation``.
-        generator: random generator of the noise.
+    Each is a number, or a tensor that broadcasts to (B, N, 3); rotation vectors get the noise of rotations.
     """
     shape = batch.translations.shape
     shift = translation * torch.randn(shape, generator=generator)
@@ -107,18 +119,13 @@ def blurred(
     return batch.with_poses(batch.translations + shift, turn @ batch.rotations)
 
 
-def asset_extents(batch: SceneBatch) -> Tensor:
-    """(C + 1, 2, 3) m: lowest and highest corner of each asset in its own frame; zeros for empty."""
-    bounds = [asset.bounds for asset in batch.scene_type.library]
-    return torch.tensor(np.stack([*bounds, np.zeros((2, 3))]), dtype=torch.float32)
-
-
 def _tokens(batch: SceneBatch, neighbours: int) -> SceneTokens:
     order = batch.is_empty.to(torch.uint8).argsort(dim=1, stable=True)[:, : max(1, int(batch.counts.max()))]
     categories = batch.categories.gather(1, order)
     poses = batch.tensor[..., :12].gather(1, order[..., None].expand(-1, -1, 12))
     present = categories != batch.scene_type.num_assets
-    bounds = asset_extents(batch)[categories]  # (B, N, 2, 3)
+    corners = np.stack([*(asset.bounds for asset in batch.scene_type.library), np.zeros((2, 3))])
+    bounds = torch.tensor(corners, dtype=torch.float32)[categories]  # (B, N, 2, 3): lowest and highest, 0 for empty
     translations, rotations = poses[..., :3], poses[..., 3:].unflatten(-1, (3, 3))
     half = 0.5 * (bounds[..., 1, :] - bounds[..., 0, :])
     center = translations + (rotations @ bounds.mean(dim=-2)[..., None])[..., 0]
@@ -174,29 +181,17 @@ def _padded(values: Tensor, dim: int, size: int, fill: float) -> Tensor:
 
 @dataclass(frozen=True)
 class SetNetworkConfig:
-    """Size of a :class:`SetNetwork`.
+    """Size of a :class:`SetNetwork`."""
 
-    Attributes:
-        features: number of features of an object.
-        categories: number of category tokens, those for *empty* and *unknown* included.
-        outputs: number of outputs for a scene.
-        hidden: width of the tokens; a multiple of ``heads``.
-        heads: number of attention heads.
-        blocks: number of induced attention blocks.
-        inducing: number of inducing points per block.
-        dropout: share of the pooled features dropped in training.
-        pair_features: number of features of each neighbour of an object.
-    """
-
-    features: int
-    categories: int
-    outputs: int
-    hidden: int = 32
+    features: int  # of an object
+    categories: int  # tokens, those for *empty* and *unknown* included
+    outputs: int  # for a scene
+    hidden: int = 32  # width of the tokens, a multiple of ``heads``
     heads: int = 2
-    blocks: int = 1
-    inducing: int = 8
-    dropout: float = 0.1
-    pair_features: int = NEIGHBOUR_FEATURES
+    blocks: int = 1  # of induced attention
+    inducing: int = 8  # points per block
+    dropout: float = 0.1  # share of the pooled features dropped in training
+    pair_features: int = NEIGHBOUR_FEATURES  # of each neighbour of an object
 
     def __post_init__(self) -> None:
         if self.hidden % self.heads:
@@ -267,8 +262,7 @@ class _ObjectEncoder(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Tokens (B, N, H), 0 for padding, and the mask (B, 1, 1, N) of attention to them; arguments as in forward."""
         there = present[..., None].to(own.dtype)
-        pairs = self.pair(offsets) + self.pair_other(neighbours) + self.pair_self(categories)[:, :, None]
-        pairs = F.gelu(pairs)
+        pairs = F.gelu(self.pair(offsets) + self.pair_other(neighbours) + self.pair_self(categories)[:, :, None])
         around = torch.cat([pairs.mean(dim=2), pairs.amax(dim=2)], dim=-1)
         tokens = self.enter(torch.cat([F.gelu(self.own(own) + self.category(categories)), around], dim=-1))
         somewhere = present.any(dim=-1, keepdim=True)
@@ -328,17 +322,10 @@ class SetNetwork(_ObjectEncoder):
         self._reset_embeddings()
 
     def forward(self, own: Tensor, categories: Tensor, offsets: Tensor, neighbours: Tensor, present: Tensor) -> Tensor:
-        """Outputs per scene: logits, or features.
+        """(B, ``outputs``) logits or features.
 
-        Args:
-            own: (B, N, F) features of each object.
-            categories: (B, N) int64 categories of the objects.
-            offsets: (B, N, K, P) features of each neighbour.
-            neighbours: (B, N, K) int64 categories of the neighbours.
-            present: (B, N) bool, False for padding.
-
-        Returns:
-            (B, ``outputs``).
+        Objects have features ``own`` (B, N, F) and ``categories`` (B, N), their neighbours ``offsets`` (B, N, K, P) and
+        categories ``neighbours`` (B, N, K); ``present`` (B, N) is False for padding.
         """
         tokens, mask = self.encode(own, categories, offsets, neighbours, present)
         somewhere = present.any(dim=-1, keepdim=True)
@@ -349,12 +336,6 @@ class SetNetwork(_ObjectEncoder):
         highest = tokens.masked_fill(~present[..., None], -1e4).amax(dim=1) * somewhere
         summary = torch.cat([pooled, total / count, highest, total / 20.0], dim=-1)
         return self.leave(self.norm(summary))
-
-
-_PRIOR_COUNT = 4.0
-"""Weight, in objects, of the variance over all groups in the variance of one group."""
-_CLIP = 8.0
-_MIN_STD = 1e-4
 
 
 @dataclass(frozen=True)
@@ -405,17 +386,104 @@ class TypicalPlaces:
 
     def inputs(self, tokens: SceneTokens) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Arguments of a :class:`~agents.evaluation.set_network.SetNetwork` for these scenes."""
-        own, pairs = self._deviations(tokens)
-        own = torch.cat([own, tokens.waves], dim=-1)
-        return own, tokens.categories, pairs, tokens.neighbours, tokens.present
-
-    def _deviations(self, tokens: SceneTokens) -> tuple[Tensor, Tensor]:
-        """Deviations of the poses (B, N, 24) and of the offsets (B, N, K, 14)."""
         there = (tokens.neighbours != self.width - 1)[..., None]
-        pairs = self.offsets.deviations(tokens.offsets, _pairs(tokens, self.width)) * there
-        return self.poses.deviations(tokens.poses, tokens.categories), pairs
+        pairs = self.offsets.deviations(tokens.offsets, _pairs(tokens, self.width)) * there  # (B, N, K, 14)
+        own = torch.cat([self.poses.deviations(tokens.poses, tokens.categories), tokens.waves], dim=-1)
+        return own, tokens.categories, pairs, tokens.neighbours, tokens.present
 
 
 def _pairs(tokens: SceneTokens, width: int) -> Tensor:
     """(B, N, K) index of the ordered pair of assets."""
     return tokens.categories[..., None] * width + tokens.neighbours
+
+
+class SetEncoder(nn.Module):
+    """Encoder of scenes of any type to 64 features; invariant to the order of slots and to empty slots.
+
+    Categories are read by asset name, so that a scene has the same features in a union of types as in its own type. An
+    asset outside the vocabulary becomes the *unknown* asset, of which the encoder reads the bounding box but no name.
+    Distances between scenes of users' own assets depend on sizes, poses and gaps, and not on names.
+
+    Args:
+        vocabulary: names of the known assets.
+        config: sizes of the network; None takes those of the shipped one.
+
+    >>> encoder = SetEncoder(("cafe_table", "teacup")).eval()
+    >>> encoder.features(SceneBatch.empty("dimsum_table", 2)).shape
+    torch.Size([2, 64])
+    """
+
+    def __init__(self, vocabulary: Sequence[str], config: SetNetworkConfig | None = None) -> None:
+        super().__init__()
+        self.vocabulary = tuple(vocabulary)
+        self.config = config or SetNetworkConfig(
+            _OWN, len(self.vocabulary) + 2, FEATURES, hidden=64, heads=2, blocks=1, dropout=0.0
+        )
+        self.network = SetNetwork(self.config)
+        self.mean: Tensor
+        self.whitening: Tensor
+        self.register_buffer("mean", torch.zeros(self.config.outputs))
+        self.register_buffer("whitening", torch.eye(self.config.outputs))
+
+    @property
+    def unknown(self) -> int:
+        """Token of an asset outside the vocabulary."""
+        return len(self.vocabulary)
+
+    def names(self, batch: SceneBatch) -> Tensor:
+        """(C + 1,) int64: the token of each category of the batch's scene type, empty last."""
+        index = {name: token for token, name in enumerate(self.vocabulary)}
+        tokens = [index.get(name, self.unknown) for name in batch.scene_type.assets]
+        return torch.tensor([*tokens, self.unknown + 1])
+
+    def forward(self, tokens: SceneTokens, names: Tensor) -> Tensor:
+        """Features (B, F) before whitening; ``names`` (C + 1,) gives the token of each category."""
+        size = (tokens.extents.clamp(min=1e-3) / 0.1).log() * tokens.present[..., None]
+        own = torch.cat([tokens.poses, tokens.waves, size], dim=-1)
+        return self.network(own, names[tokens.categories], tokens.offsets, names[tokens.neighbours], tokens.present)
+
+    @torch.no_grad()
+    def features(self, batch: SceneBatch) -> Tensor:
+        """(B, F) float32 whitened features, on the CPU."""
+        was_training = self.training
+        self.eval()
+        names = self.names(batch)
+        parts = [batch[start : start + _CHUNK].to("cpu") for start in range(0, len(batch), _CHUNK)]
+        raw = torch.cat([self(scene_tokens(part), names) for part in parts]) if parts else torch.empty(0, FEATURES)
+        self.train(was_training)
+        return (raw - self.mean) @ self.whitening
+
+    def save(self, path: str | os.PathLike[str], note: str = "") -> Path:
+        """Write weights (float16; mean and whitening float32), vocabulary and size to one ``.safetensors`` file.
+
+        Args:
+            path: file to write.
+            note: a sentence on how the encoder was trained, kept in the file.
+        """
+        weights = {name: value.detach().contiguous() for name, value in self.state_dict().items()}
+        weights = {name: value.half() if name.startswith("network.") else value for name, value in weights.items()}
+        metadata = {"vocabulary": json.dumps(self.vocabulary), "config": json.dumps(asdict(self.config)), "note": note}
+        return write_tensors(path, weights, metadata)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str] | None = None) -> SetEncoder:
+        """The encoder in ``path``, frozen and in evaluation mode; None takes the shipped one.
+
+        Raises:
+            InvalidInputError: the file does not exist.
+            CorruptFileError: the file was not written by :meth:`save`.
+        """
+        return _load(str(SHIPPED if path is None else Path(path).resolve()))
+
+
+@cache
+def _load(path: str) -> SetEncoder:
+    try:
+        weights, metadata = read_tensors(path)
+        encoder = SetEncoder(json.loads(metadata["vocabulary"]), SetNetworkConfig(**json.loads(metadata["config"])))
+        encoder.load_state_dict({name: value.float() for name, value in weights.items()})
+    except FileNotFoundError:
+        raise InvalidInputError(f"no set encoder at {path!r}; train_set_encoder makes one") from None
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CorruptFileError(f"{path!r} is not a set encoder written by SetEncoder.save: {error}") from error
+    return encoder.eval().requires_grad_(False)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from agents.planning.ledger import (
     Candidate,
@@ -24,7 +22,11 @@ from agents.planning.ledger import (
     state_value,
 )
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import SceneBatch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from scene_envs.scene import SceneBatch
 
 
 @register_planner("evolution")
@@ -85,7 +87,6 @@ class EvolutionPlanner(PlannerSettings):
 
     def _mated(self, search: SearchBudget, index: int, members: list[Member], rng: np.random.Generator) -> Candidate:
         """The candidate to inpaint: a member, or its splice with another one."""
-
         problem: Any = search.problem
         (parent, _), others = members[index], members[:index] + members[index + 1 :]
         if not others or not hasattr(problem, "with_scene") or rng.random() >= self.crossover:
@@ -114,18 +115,13 @@ def spliced(
 
     The plane has a random direction. Its place is the one at which most objects are kept. About a quarter of the
     objects of both scenes together, or more, are on either side. If there are too few slots, the objects nearest to the
-    plane are left out.
-
-    Args:
-        first: a batch of one; the scene has its fixed objects.
-        second: a batch of one of the same shape.
-        first_mask: (N,) bool, slots of ``first`` that are left out.
-        second_mask: (N,) bool, slots of ``second`` that are left out.
-        rng: draws the direction.
+    plane are left out. The scene has the fixed objects of ``first``; slots of the masks (N,) are left out.
 
     Returns:
         (N, D) raw scene.
     """
+    import torch
+
     fixed = torch.arange(first.tensor.shape[1]) < len(first.scene_type.fixed)
     angle = rng.uniform(0, 2 * np.pi)
     normal = torch.tensor([np.cos(angle), np.sin(angle)], dtype=torch.float32)
@@ -134,7 +130,7 @@ def spliced(
         kept = ~(scene.is_empty[0] | mask | fixed)
         rows.append(scene.tensor[0, kept])
         places.append(scene.translations[0, kept, :2] @ normal)
-    result = SceneBatch.empty(first.scene_type, 1, len(fixed)).tensor[0]
+    result = first.empty(first.scene_type, 1, len(fixed)).tensor[0]
     result[fixed] = first.tensor[0, fixed]
     cuts = torch.cat(places).sort().values
     if not len(cuts):

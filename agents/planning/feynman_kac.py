@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from agents.planning.ledger import (
     PlannerSettings,
@@ -21,7 +19,11 @@ from agents.planning.ledger import (
 )
 from agents.planning.simple import GreedyPlanner
 from scene_envs.errors import InvalidInputError
-from scene_envs.scene import SceneBatch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from scene_envs.scene import SceneBatch
 
 
 def systematic(weights: np.ndarray, uniform: float) -> np.ndarray:
@@ -48,15 +50,8 @@ class Particles:
 
     At ``resamplings`` steps, each group is resampled with the weights exp(strength * (value - value at the last
     resampling)). The product of the weights of a path is then exp(strength * last value) (Singhal et al. 2025,
-    difference potential).
-
-    Args:
-        parents: (B,) parent of each particle, any hashable.
-        rngs: random generator of each parent.
-        values: function from denoised scenes to their values Φ (B,).
-        resamplings: number of resamplings.
-        begin: share of the denoising steps before the first resampling.
-        strength: factor on the values in the weights.
+    difference potential). ``parents`` (B,) are hashable and have a generator each in ``rngs``; ``values`` gives Φ (B,)
+    of denoised scenes.
     """
 
     def __init__(
@@ -75,6 +70,8 @@ class Particles:
 
     def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch]) -> Tensor | None:
         """(B,) index of the particle that each place continues with; None at a step without resampling."""
+        import torch
+
         if step not in self.at(steps):
             return None
         now = self.values(denoised()).double().numpy()

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from agents.configuration.composition import build
 from agents.planning.ledger import (
@@ -22,10 +19,14 @@ from agents.planning.ledger import (
     register_planner,
 )
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.scene import SceneBatch, hull_corners
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from scene_envs.scene import SceneBatch
 
 WEIGHTS = ("overlap",)
-"""Differentiable log-weights of :mod:`agents.planning.gradient`."""
+"""Differentiable log-weights: functions of this module."""
 
 
 @register_planner("gradient")
@@ -89,16 +90,14 @@ class GradientPlanner(PlannerSettings):
         return build(settings, keys, "planner.planner.")
 
     def _guide(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Guidance:
-
-        weight = self.weight if callable(self.weight) else _WEIGHT_FUNCTIONS[self.weight]
-        return Guidance(weight, self.strength, self.begin)
+        return Guidance(self.weight if callable(self.weight) else overlap, self.strength, self.begin)
 
 
 def _is_guidable(settings: type[PlannerSettings]) -> bool:
     return settings.widens and not settings.steers
 
 
-Weight = Callable[[SceneBatch, Tensor], Tensor]
+Weight = Callable[["SceneBatch", "Tensor"], "Tensor"]
 """``(batch, translations) -> (B,)``: log-weight of the scenes of ``batch`` with these translations (B, N, 3), m.
 
 Differentiable in ``translations``.
@@ -109,8 +108,11 @@ def overlap(batch: SceneBatch, translations: Tensor) -> Tensor:
     """(B,) minus half the sum of squared overlaps of objects, mm²: 0 where no two overlap.
 
     Each object is the upright cylinder around its asset. The overlap of a pair is the smaller of the overlap of their
-    circles and that of their heights. Pairs of two welded objects are left out.
+    circles and that of their heights. Pairs of two welded objects are left out, and pairs in which one circle contains
+    the centre of the other.
     """
+    import torch
+
     radius, low, high = (column[batch.categories.clamp(max=batch.scene_type.num_assets)] for column in _sizes(batch))
     flat = translations[..., :2]
     away = (flat[:, :, None] - flat[:, None]).square().sum(-1).clamp(min=1e-12).sqrt()
@@ -120,18 +122,18 @@ def overlap(batch: SceneBatch, translations: Tensor) -> Tensor:
     pairs = (
         ~batch.is_empty[:, :, None] & ~batch.is_empty[:, None] & (batch.is_free[:, :, None] | batch.is_free[:, None])
     )
-    pairs = pairs.triu(diagonal=1) & ~_contained(across, radius)
+    inside = across.detach() > torch.minimum(radius[:, :, None], radius[:, None])  # on a table, in a bowl
+    pairs = pairs.triu(diagonal=1) & ~inside
     depth = torch.minimum(across, along).clamp(min=0.0)
     return -0.5 * (1e3 * torch.where(pairs, depth, torch.zeros_like(depth))).square().sum(dim=(1, 2))
 
 
-def _contained(across: Tensor, radius: Tensor) -> Tensor:
-    """(B, N, N) bool: pairs in which one circle contains the centre of the other: objects on tables, food in bowls."""
-    return across.detach() > torch.minimum(radius[:, :, None], radius[:, None])
-
-
 def _sizes(batch: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
     """Radius, lowest and highest point of every asset, (C + 1,) m each; 0 for the empty slot."""
+    import torch
+
+    from scene_envs.scene import hull_corners
+
     rows = [
         (corners[:, :2].norm(dim=-1).amax(), corners[:, 2].amin(), corners[:, 2].amax())
         for corners in hull_corners(batch.scene_type.library)
@@ -141,13 +143,7 @@ def _sizes(batch: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class Guidance:
-    """Gradient of a log-weight at the scenes that the network expects.
-
-    Args:
-        weight: the log-weight.
-        strength: factor on the log-weight.
-        begin: share of the denoising steps that come before guidance.
-    """
+    """Gradient of a log-weight, times ``strength``, at the scenes that the network expects; none before ``begin``."""
 
     role = "guide"
 
@@ -163,6 +159,8 @@ class Guidance:
         """
         if step < int(self.begin * steps) or not self.strength:
             return None
+        import torch
+
         batch = denoised()
         with torch.enable_grad():
             translations = batch.translations.detach().clone().requires_grad_()
@@ -170,7 +168,3 @@ class Guidance:
             (gradient,) = torch.autograd.grad(total, translations)
         deviations = std * (self.strength * torch.nan_to_num(gradient)).to(std)
         return std * deviations / deviations.norm(dim=-1, keepdim=True).clamp(min=1.0)
-
-
-_WEIGHT_FUNCTIONS = {"overlap": overlap}
-"""Differentiable log-weights by name."""

@@ -190,12 +190,7 @@ class SearchBudget:
 
 
 class SteeredProblem:
-    """A search problem with steered expansions.
-
-    Args:
-        problem: problem to search.
-        planner: name of the planner that steers.
-        steering: the argument of ``expand_batch``; may change between expansions.
+    """A search problem whose expansions get ``steering``, which the planner called ``planner`` may change.
 
     Raises:
         InvalidInputError: the expansions of ``problem`` cannot be steered.
@@ -258,11 +253,10 @@ class PlannerSettings:
         return replace(self, **unset) if unset else self
 
 
-_FILES = {"beam": "simple", "best_of": "simple", "greedy": "simple"}
-"""Files of planners that are not called like their planner."""
-_SHIPPED = ("beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts")
+_SHIPPED = {name: name for name in ("evolution", "feynman_kac", "gradient", "mcts")}
+_SHIPPED |= dict.fromkeys(("beam", "best_of", "greedy"), "simple")
 _PLANNERS: Registry[type[PlannerSettings]] = Registry(
-    "planner", ENTRY_POINT_GROUP, modules={name: f"agents.planning.{_FILES.get(name, name)}" for name in _SHIPPED}
+    "planner", ENTRY_POINT_GROUP, modules={name: f"agents.planning.{file}" for name, file in _SHIPPED.items()}
 )
 Settings = TypeVar("Settings", bound=type[PlannerSettings])
 

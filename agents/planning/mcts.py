@@ -1,4 +1,4 @@
-"""MCTS as published: all children of a leaf are made at once, and the value of one or of all is backed up."""
+"""MCTS as published: the planner that makes all children of a leaf at once, and backs up the value of one or of all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Search tree in ``tree.json``: every scene of a search with its parent, value and cost."""
+"""Output of a search: every scene in ``tree.json``, figures, pictures, and the page ``tree.html``."""
 
 from __future__ import annotations
 
@@ -23,6 +23,11 @@ from scene_envs.envs import SearchState
 from scene_envs.errors import CorruptFileError
 from scene_envs.files import finite, page_part, page_template, write_json, write_text
 from scene_envs.scene import SceneBatch
+
+MAX_PATH_SCENES = 60
+"""Largest number of scenes of the best path that are shown; some steps of a longer path are left out."""
+MAX_OTHER_SCENES = 24
+"""Largest number of other scenes that are shown, the best ones."""
 
 _FORMAT = "scene-envs search tree 1"
 
@@ -185,19 +190,9 @@ def search_metrics(
     spent: int,
     from_scenes: bool,
 ) -> dict[str, Any]:
-    """The figures of a run.
+    """The figures of a run that generated ``spent`` scenes; ``stopped`` says why it ended early, and may be empty.
 
-    Args:
-        objective: the objective of the search.
-        scale: objective at Φ = 1.
-        config: the settings.
-        searches: all plans.
-        best_of: the baseline; None without one.
-        firsts: best of the first samples of each search, or the scene it started from, by the seed of the search.
-        seconds: duration of the search and the baseline.
-        stopped: reason for which the run ended early; empty if it did not.
-        spent: number of scenes generated.
-        from_scenes: whether the searches started from given scenes.
+    ``firsts`` has the best of the first samples of each search, or its start scene, by the seed of the search.
     """
     search = min(searches, key=loss_of)
     first = firsts[search.best_state.seed]
@@ -238,23 +233,12 @@ def _of_plan(plan: PlanResult) -> dict[str, Any]:
 
 
 def draw_curve(
-    curves: Mapping[str, Sequence[float]],
-    path: Path,
-    *,
-    num_steps: int,
-    first: int,
-    scale: float = 1.0,
-    label: str = "objective",
-) -> Path:
-    """Best objective against denoiser evaluations, one line per planner.
+    curves: Mapping[str, Sequence[float]], path: Path, *, num_steps: int, first: int, scale: float, label: str
+) -> None:
+    """Draw the best objective against denoiser evaluations, ``num_steps`` per scene, one line per planner.
 
-    Args:
-        curves: best Φ after each generated scene, by planner; values that are not finite are left out.
-        path: image file to write.
-        num_steps: denoiser evaluations per generated scene.
-        first: number of scenes that were fresh samples in the tree search; a line marks their end. 0 draws no line.
-        scale: raw objective at Φ = 1.
-        label: name of the objective.
+    ``curves`` has the best Φ after each generated scene; values that are not finite are left out. A line marks the end
+    of the ``first`` scenes, the fresh samples. ``scale`` is the objective called ``label`` at Φ = 1.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -276,48 +260,26 @@ def draw_curve(
     if axes.get_legend_handles_labels()[0]:
         axes.legend(frameon=False, loc="lower right")
     figure.savefig(path)
-    return path
 
 
-def draw_scene(scene: SceneBatch, state: Any, path: Path, *, width: int = 640, height: int = 480) -> Path:
-    """Draw one scene; the objects that its state would regenerate next are red.
-
-    Args:
-        scene: a batch of one.
-        state: search state of the scene; ``value``, ``objective`` and ``mask`` (N,) are read.
-        path: image file to write.
-        width: width of the picture in pixels.
-        height: height of the picture in pixels.
-    """
+def draw_scene(scene: SceneBatch, state: Any, path: Path) -> None:
+    """Draw the scene of a search state, a batch of one; the objects that it would regenerate next are red."""
     from scene_envs.render import gallery, render
 
     marked = state.mask.unsqueeze(0) & scene.is_free
-    image = render(scene, width=width, height=height, highlight=marked)[0]
+    image = render(scene, width=640, height=480, highlight=marked)[0]
     objects = int(scene.is_free.sum())
     objective = f"objective {state.objective:.4g}" if state.valid else "not scored"
     caption = f"{objective} | {objects} free objects | {int(marked.sum())} to redo (red)"
     gallery([image], columns=1, captions=[caption]).save(path)
-    return path
-
-
-MAX_PATH_SCENES = 60
-"""Largest number of scenes of the best path that are shown; some steps of a longer path are left out."""
-MAX_OTHER_SCENES = 24
-"""Largest number of other scenes that are shown, the best ones."""
 
 
 @dataclass(frozen=True)
 class Card:
     """A scene in the drawing of the best scenes and their ancestors.
 
-    Attributes:
-        node: node of the scene.
-        column: depth of the node; the first samples, or the scene that the search started from, have depth 0.
-        row: row of the card, counted from 0; a first child is in the row of its parent.
-        parent: index of the parent's card; None for a first sample.
-        number: number of the scene in its search, counted from 1.
-        frame: index of the scene in the 3-D view, which draws its picture; None without one.
-        on_path: whether it leads to the best scene.
+    ``column`` is the depth, 0 for first samples or the start scene; a first child is in the ``row`` of its ``parent``,
+    an index of cards. ``number`` counts the search's scenes from 1. ``frame`` is the scene's index in the 3-D view.
     """
 
     node: TreeNode
@@ -357,15 +319,11 @@ def write_tree_page(
     metrics: Mapping[str, Any],
     *,
     returned: SceneBatch | None = None,
-) -> Path:
+) -> None:
     """Write the page of the first search of ``record``, which works offline and without other files.
 
-    Args:
-        path: HTML file to write.
-        record: record of all scenes.
-        scenes: a batch of one for each id of :func:`shown_nodes`.
-        metrics: contents of ``metrics.json``.
-        returned: scene that the search returned, if it is not a node because the planner changed it at the end.
+    ``scenes`` has a batch of one for each id of :func:`shown_nodes`. ``returned`` is the scene that the search
+    returned, if it is not a node because the planner changed it at the end.
     """
     from jinja2.utils import htmlsafe_json_dumps
     from markupsafe import Markup
@@ -381,7 +339,7 @@ def write_tree_page(
     if returned is not None:
         captions.append("the scene that the search returned")
     cards = _cards(record, shown, way)
-    on_path = set(way)
+    on_path, baseline = set(way), metrics.get("best_of", {}).get("curve", [])
     steps = [k for k, node in enumerate(shown) if node in on_path] + ([] if returned is None else [len(shown)])
     data = {
         "parent": [-1 if node.parent is None else number[node.parent] for node in tree],
@@ -395,7 +353,7 @@ def write_tree_page(
         "path": [number[node] for node in way],
         "steps": steps,
         "name": _words(metrics["objective"]),
-        "baseline": _baseline(metrics),
+        "baseline": [None if value is None else metrics["objective_scale"] * value for value in baseline],
         "nfe": record.settings["nfe_per_scene"],
         "from_scene": not _first(record),
     }
@@ -418,7 +376,6 @@ def write_tree_page(
         scene_type=_words(batch.scene_type.name),
     )
     write_text(path, page)
-    return path
 
 
 def _cards(record: SearchRecord, shown: Sequence[int], way: Sequence[int]) -> list[Card]:
@@ -456,13 +413,6 @@ def _caption(node: TreeNode, number: Mapping[int, int], way: Sequence[int]) -> s
     made = "where the search started" if node.parent is None else f"made as no. {number[node.id]}"
     objective = "not scored" if node.objective is None else f"objective {node.objective:.4g}"
     return f"{place} · {made} · {objective} · {len(node.mask)} slots to redo"
-
-
-def _baseline(metrics: Mapping[str, Any]) -> list[float | None]:
-    """Best objective of the independent samples after each of them; empty without a baseline."""
-    scale = metrics["objective_scale"]
-    curve = metrics.get("best_of", {}).get("curve", [])
-    return [None if value is None else scale * value for value in curve]
 
 
 def _words(name: object) -> str:

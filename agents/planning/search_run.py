@@ -129,7 +129,13 @@ def _search(
     loaded = resolve_prior(prior)
     fixed = {key: value for key, value in named.items() if key not in _LIMITS} | {"prior": loaded}
     if starts is not None:
-        starts, fixed = _fitting(starts, loaded, config.slots), {**fixed, "scenes": starts}
+        if starts.scene_type.name != loaded.scene_type.name:
+            raise InvalidInputError(
+                f"the prior makes scenes of {loaded.scene_type.name!r}, and the search would start from scenes of "
+                f"{starts.scene_type.name!r}; give a prior of that type"
+            )
+        fixed["scenes"], least = starts, max(loaded.scene_type.slots, starts.tensor.shape[1])
+        starts = starts.with_slots(least if config.slots is None else config.slots)
     run = _Run(loaded, objective, config, fixed, folder, starts)
     started = time.perf_counter()
     planner, scenes = config.planner.make(config.branching), config.expansions
@@ -265,16 +271,6 @@ class _Run:
 
 def _scenes(env: SearchEnv, plans: Sequence[PlanResult]) -> SceneBatch:
     return SceneBatch.concatenate([env.scene(plan.best_state) for plan in plans])
-
-
-def _fitting(scenes: SceneBatch, prior: Any, slots: int | None) -> SceneBatch:
-    """Scenes to start from, with ``slots`` slots, or no fewer than those of the prior's scene type."""
-    if scenes.scene_type.name != prior.scene_type.name:
-        raise InvalidInputError(
-            f"the prior makes scenes of {prior.scene_type.name!r}, and the search would start from scenes of "
-            f"{scenes.scene_type.name!r}; give a prior of that type"
-        )
-    return scenes.with_slots(max(prior.scene_type.slots, scenes.tensor.shape[1]) if slots is None else slots)
 
 
 def _write(outcome: SearchOutcome, config: SearchConfig, best: SceneBatch, first: SearchState, output: Path) -> None:

@@ -49,12 +49,20 @@ class Journal:
         self.path = Path(path)
         self._states: list[SearchState] = []
         self._taken = 0
-        settings = {key: _described(value) for key, value in settings.items()}
-        if self.path.exists() and self.path.stat().st_size:
-            self._read(settings)
-        else:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._begin(settings)
+        described = {key: _described(value) for key, value in settings.items()}
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        records = self._read() if self.path.exists() else []
+        if not records:  # a new file, or a process was killed before the first record was complete
+            self.path.write_bytes(_MAGIC)
+            self._append(described)
+            return
+        for name in sorted({*described, *records[0]}):
+            before, now = records[0].get(name), described.get(name)
+            if before != now:
+                raise InvalidInputError(
+                    f"{self.path} holds a search with {name}={before}, not {now}; give another output, or that value"
+                )
+        self._states = [_state(values) for states in records[1:] for values in states]
 
     def __len__(self) -> int:
         """Number of states that an earlier run wrote."""
@@ -86,10 +94,6 @@ class Journal:
             for record in islice(self._records(file), 1, None):
                 yield from map(_state, record)
 
-    def _begin(self, settings: Mapping[str, str]) -> None:
-        self.path.write_bytes(_MAGIC)
-        self._append(settings)
-
     def _append(self, content: Any) -> None:
         buffer = io.BytesIO()
         torch.save(content, buffer)
@@ -98,7 +102,7 @@ class Journal:
             file.write(_HEAD.pack(len(record), zlib.crc32(record)) + record)
             file.flush()
 
-    def _read(self, settings: Mapping[str, str]) -> None:
+    def _read(self) -> list[Any]:
         records = []
         with self.path.open("r+b") as file:
             begun = file.read(len(_MAGIC))
@@ -109,16 +113,7 @@ class Journal:
                 records.append(record)
                 whole = file.tell()
             file.truncate(whole)  # a process was killed while writing the rest
-        if not records:  # killed before the first record was complete
-            self._begin(settings)
-            return
-        for name in sorted({*settings, *records[0]}):
-            before, now = records[0].get(name), settings.get(name)
-            if before != now:
-                raise InvalidInputError(
-                    f"{self.path} holds a search with {name}={before}, not {now}; give another output, or that value"
-                )
-        self._states = [_state(values) for states in records[1:] for values in states]
+        return records
 
     def _records(self, file: BinaryIO) -> Iterator[Any]:
         """The complete records; the file is positioned behind the record that is yielded."""
@@ -180,13 +175,6 @@ Ask = Callable[[Request], Sequence[Any]]
 
 class Lane:
     """One plan's view of a session: the environment with the plan's own root, and a record of the plan's expansions.
-
-    Args:
-        problem: the environment.
-        root: state that the plan starts from.
-        budget: largest number of expansions.
-        ask: function that expands pairs for this lane.
-        root_counts: whether the root may be the best state.
 
     Attributes:
         values: objective of every expansion; NaN where it failed.
@@ -284,7 +272,11 @@ class Session:
             root_counts: whether a root may be the best state of its plan.
         """
         lanes = self.lanes = [Lane(self.problem, root, budget, self._expand, root_counts) for root in roots]
-        report = None if progress is None else lambda *_: progress(*_overall(lanes))
+
+        def report(*_: float) -> None:
+            if progress is not None:
+                progress(sum(len(lane.values) for lane in lanes), max(0.0, min(lane.best[0] for lane in lanes)))
+
         with terminable():
             if len(lanes) > 1:
                 return self._run_together(planner, lanes, report)
@@ -294,7 +286,7 @@ class Session:
                 self.stopped = _reason(interrupt)
                 return [lanes[0].result()]
 
-    def _run_together(self, planner: Any, lanes: list[Lane], report: Progress | None) -> list[PlanResult]:
+    def _run_together(self, planner: Any, lanes: list[Lane], report: Progress) -> list[PlanResult]:
         """Run the plans in threads, one at a time and in order: each runs until it asks for expansions or ends."""
         messages: queue.Queue[Request | PlanResult | BaseException] = queue.Queue()
         answers: list[queue.Queue[Sequence[Any] | None]] = [queue.Queue() for _ in lanes]
@@ -354,8 +346,7 @@ class Session:
                 answers[index].put(states[: len(pairs)] if enough else None)
                 states = states[len(pairs) :] if enough else []
                 receive(index)
-            if report is not None:
-                report(0, 0.0)
+            report(0, 0.0)
         if failure is not None:
             raise failure
         return [results[index] for index in sorted(results)]
@@ -394,7 +385,3 @@ def _plan(planner: Any, lane: Lane, report: Progress | None) -> PlanResult:
         return planner.plan(lane, lane.budget, report)
     except SearchStoppedError:  # the planner did not catch it
         return lane.result()
-
-
-def _overall(lanes: Sequence[Lane]) -> tuple[int, float]:
-    return sum(len(lane.values) for lane in lanes), max(0.0, min(lane.best[0] for lane in lanes))

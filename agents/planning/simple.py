@@ -1,4 +1,4 @@
-"""Best of N: the planner that draws independent samples."""
+"""Planners that need no more than a budget: best of N, beam search and greedy repair."""
 
 from __future__ import annotations
 

@@ -90,8 +90,7 @@ class SampleCheck:
         meaning, such as the categories of empty scenes, is NaN. Assets without geometry have no stacks.
         """
         from agents.evaluation.classifier import classifier_accuracy
-        from agents.evaluation.layouts import stack_wasserstein
-        from agents.evaluation.metrics import category_kl, count_wasserstein
+        from agents.evaluation.layouts import category_kl, count_wasserstein, stack_wasserstein
 
         batch = batch.to("cpu")
         score = self.scorer(batch, self.prompts)
@@ -325,7 +324,7 @@ def _number(value: float) -> float:
 
 def realism(batch: SceneBatch) -> dict[str, float]:
     """Cheap figures of finished scenes: share of objects in the workspace, median height error (mm) per support."""
-    from agents.evaluation.metrics import height_errors, workspace_fraction
+    from agents.evaluation.layouts import height_errors, workspace_fraction
 
     figures = {"workspace_fraction": workspace_fraction(batch)} if int(batch.counts.sum()) else {}
     for kind, errors in height_errors(batch).items():

@@ -1,4 +1,4 @@
-"""Initial priors of pretraining runs: fresh priors, and existing priors that are trained further."""
+"""Initial state of a pretraining run: prior, training scenes and held-out scenes."""
 
 from __future__ import annotations
 
@@ -24,56 +24,138 @@ from agents.networks.geometry import ContactsConfig, RelationsConfig, RotationFe
 from agents.networks.registry import NetworkConfig, network_config
 from agents.networks.text_encoders import VOCABULARY, AnyTextConfig, text_config
 from agents.pretraining.settings import PretrainConfig
-from agents.priors.config import PROCESSES, MixedPriorConfig, PriorConfig
+from agents.priors.config import MixedPriorConfig, PriorConfig
 from agents.priors.continuous import ContinuousPrior, SceneCode
+from agents.priors.files import PriorFacts
 from agents.priors.mixed import MixedPrior
 from agents.priors.prior import ScenePrior
 from scene_envs.datasets import SceneDataset, to_union
+from scene_envs.datasets.dataset import union_normalizer
+from scene_envs.datasets.generation import fixed_normalizer
 from scene_envs.datasets.prompts import describe_all
-from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.grammars import Grammar
+from scene_envs.errors import InvalidInputError
+from scene_envs.grammars import Grammar, get_grammar
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE_FEATURES, SceneBatch
-from scene_envs.scene_types import get_scene_type
+from scene_envs.scene_types import get_scene_type, register_scene_type, union_scene_type
 
 MOMENTS = ("category", "feature", "scene")
 """Groups of values whose mean and standard deviation the preconditioning of a network uses."""
-
 FITTED_ON = 20_000
 """Largest number of scenes to which moments are fitted."""
+PROMPTS_PER_SCENE = 3
+
+_SAMPLE = 1024
+"""Number of scenes of a grammar to which the moments and the vocabulary are fitted."""
+_HELD_OUT = 512
+"""Number of held-out scenes of a grammar."""
+
+
+def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
+    """The prior that a run starts from, its training scenes, and held-out scenes (K, N, D).
+
+    A run from an older prior takes the scene type of its data; if a grammar makes the data, it takes that of the prior.
+    """
+    older = PriorFacts.of(config.prior) if config.prior else None
+    if older is not None and config.text.is_read and not older.text:
+        raise InvalidInputError(
+            f"text={config.text.encoder} with prior={config.prior!r}, which reads no prompts; leave text= out, or "
+            "train a fresh prior"
+        )
+    if config.data == "grammar":
+        if older is not None:
+            config = replace(config, scene=older.scene_type)
+        grammar = get_grammar(config.scene)
+        sample = grammar.sample(np.random.default_rng([config.seed, _SAMPLE]), _SAMPLE)
+        reads = config.text.is_read if older is None else bool(older.text)
+        prompts = describe_all(sample, np.random.default_rng(config.seed), count=PROMPTS_PER_SCENE) if reads else []
+        prior = build_prior(config, sample.tensor, fixed_normalizer(grammar), prompts)
+        if config.heldout:
+            held_out = SceneBatch(_heldout(config.heldout, prior.scene_type.name).tensor[:2048], prior.scene_type)
+        else:
+            held_out = grammar.sample(np.random.default_rng([config.seed, _SAMPLE, 1]), _HELD_OUT)
+        return prior, GrammarStream(grammar, prior), prior.encode(held_out)
+    if "," in config.data:
+        return _prepare_union(config)
+    dataset = SceneDataset.load(config.data)
+    name, asked = dataset.scene_type.name, str(getattr(config.scene, "name", config.scene))
+    if older is not None:
+        config = replace(config, scene=name)
+    elif name != asked:
+        raise InvalidInputError(f"data={config.data!r} holds scenes of {name!r}, and scene={asked}; give scene={name}")
+    if len(dataset) < 2:
+        raise InvalidInputError(
+            f"data={config.data!r} has {len(dataset)} scenes; one is held out, so give at least two"
+        )
+    if config.heldout:
+        return prepare_from(config, dataset, _heldout(config.heldout, name))
+    return prepare_from(config, *split_heldout(dataset))
+
+
+def _heldout(folder: str, scene_type: str) -> SceneDataset:
+    """The dataset of held-out scenes, which must be of the scene type."""
+    found = SceneDataset.load(folder)
+    if found.scene_type.name != scene_type:
+        raise InvalidInputError(
+            f"heldout={folder!r} holds scenes of {found.scene_type.name!r}, the training scenes are of {scene_type!r}"
+        )
+    return found
+
+
+def split_heldout(dataset: SceneDataset) -> tuple[SceneDataset, SceneDataset]:
+    """Training scenes, and the last 2 % (at least one), which no run trains on."""
+    split = len(dataset) - max(1, len(dataset) // 50)
+    return dataset[:split], dataset[split:]
+
+
+def prepare_from(
+    config: PretrainConfig, training: SceneDataset, heldout: SceneDataset
+) -> tuple[ScenePrior, TrainingData, Tensor]:
+    """The initial prior, its training scenes, and at most 2,048 held-out scenes (K, N, D), both as it encodes them."""
+    prior = build_prior(config, training.tensor, training.normalizer, training.prompt_sets)
+
+    def encode(scenes: Tensor) -> Tensor:
+        return torch.cat([prior.encode(SceneBatch(part, prior.scene_type)) for part in scenes.split(10_000)])
+
+    return prior, SceneTable(encode(training.tensor), training.prompt_sets), encode(heldout.tensor[:2048])
+
+
+def _prepare_union(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
+    if config.heldout:
+        raise InvalidInputError(
+            f"heldout={config.heldout!r} is not read with several datasets: 2 % of each are held out; leave it out"
+        )
+    whole = [SceneDataset.load(folder.strip()) for folder in config.data.split(",")]
+    union = register_scene_type(union_scene_type([dataset.scene_type for dataset in whole]))
+    parts = [dataset.stable_split((0.98, 0.02), seed=0) for dataset in whole]
+    share = slice(min(5000, FITTED_ON // len(whole)))  # moments see scenes of every type
+    some = torch.cat([to_union(dataset.batch(share), union).tensor for dataset, _ in parts])
+    normalizer = union_normalizer([dataset.normalizer for dataset in whole], union)
+    prompts = [prompt for dataset in whole for prompt in dataset.prompt_sets]
+    prior = build_prior(replace(config, scene=union.name), some, normalizer, prompts)
+    data = UnionTable([train for train, _ in parts], prior)
+    heldout = torch.cat([data.encode(held.batch(slice(2048 // len(whole)))) for _, held in parts])
+    return prior, data, heldout
 
 
 def build_prior(
     config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]] = ()
 ) -> ScenePrior:
-    """The prior that ``config`` starts from: an older one, or a fresh one with preconditioning fitted to raw scenes.
+    """The prior that ``config`` starts from: an older one, or a fresh one, fitted to ``raw`` scenes (M, N, D).
 
-    Args:
-        config: configuration of the run.
-        raw: (M, N, D) raw scenes.
-        normalizer: normaliser of raw scenes.
-        prompts: prompts of every scene, the source of the vocabulary of a prior that reads prompts.
+    The ``prompts`` of every scene are the source of the vocabulary of a fresh prior that reads prompts.
     """
     if config.prior:
         return _started(config, raw, prompts)
-    if config.process.moments not in MOMENTS:
-        raise unknown_name("moments", config.process.moments, MOMENTS)
     if config.process.name == "continuous":
         return _continuous(config, raw, normalizer)
-    if config.process.name == "mixed":
-        return _mixed(config, raw, normalizer, prompts)
-    raise unknown_name("process", config.process.name, PROCESSES)
+    return _mixed(config, raw, normalizer, prompts)
 
 
 def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str]]) -> ScenePrior:
-    """The prior that ``config`` names, with its own normalizer, for raw scenes (M, N, D) of its type.
+    """The prior that ``config`` names, for raw scenes (M, N, D) of its type; a warning lists words that it lacks.
 
-    It keeps its settings of process and loss, except for ``open_empty_share``, which is that of ``config``. It keeps
-    its vocabulary; words of ``prompts`` that it lacks are listed in a warning.
-
-    Raises:
-        InvalidInputError: scene type or slots of the prior are not those of the data, or a feature that the prior takes
-            as constant varies in the scenes.
+    It keeps its normaliser, vocabulary and settings, except for ``open_empty_share``, which is that of ``config``.
     """
     slots = raw.shape[1]
     prior = ScenePrior.load(config.prior)
@@ -170,19 +252,11 @@ def _chain(config: PretrainConfig) -> dict[str, Any]:
 def _text(config: PretrainConfig, prompts: Sequence[Sequence[str]]) -> AnyTextConfig | None:
     if not config.text.is_read:
         return None
-    text = config.text.vocabulary
     encoder = text_config(config.text.encoder, (prompt for group in prompts for prompt in group))
-    if isinstance(encoder, TextConfig):
-        return replace(
-            encoder,
-            width=text.width,
-            depth=text.depth,
-            latents=text.latents,
-            window=text.window,
-            numbers=text.numbers,
-            count_tokens=max(_kinds(config.scene)) + 2 if _conditions_counts(config) else 0,
-        )
-    return encoder
+    if not isinstance(encoder, TextConfig):
+        return encoder
+    sizes = {name: getattr(config.text.vocabulary, name) for name in ("width", "depth", "latents", "window", "numbers")}
+    return replace(encoder, count_tokens=max(_kinds(config.scene)) + 2 if _conditions_counts(config) else 0, **sizes)
 
 
 def _network(
@@ -260,9 +334,6 @@ def _rotations(normalizer: Normalizer) -> tuple[tuple[float, ...], tuple[float, 
     return tuple(((high - low) / 2).tolist()), tuple(((high + low) / 2).tolist())
 
 
-PROMPTS_PER_SCENE = 3
-
-
 class TrainingData(Protocol):
     """Training scenes; a draw depends only on the generator, so that a run can be resumed at any step."""
 
@@ -275,12 +346,7 @@ class TrainingData(Protocol):
 
 
 class SceneTable:
-    """Scenes in memory, drawn with replacement.
-
-    Args:
-        scenes: (M, N, D) scenes as the prior encodes them.
-        prompts: prompts of every scene; may be empty if draws need no prompts.
-    """
+    """Scenes (M, N, D) in memory as the prior encodes them, drawn with replacement, and the prompts of every scene."""
 
     def __init__(self, scenes: Tensor, prompts: Sequence[Sequence[str]] = ()) -> None:
         self.scenes = scenes
@@ -298,12 +364,7 @@ class SceneTable:
 
 
 class UnionTable:
-    """Scenes of several types in memory, as scenes of their union; each type is as likely as the others.
-
-    Args:
-        datasets: one dataset per scene type.
-        prior: prior of the union, which encodes the drawn scenes.
-    """
+    """Scenes of several types in memory, as the prior of their union encodes them; all types are equally likely."""
 
     def __init__(self, datasets: Sequence[SceneDataset], prior: ScenePrior) -> None:
         self.datasets = datasets
@@ -336,21 +397,13 @@ class UnionTable:
 
 
 class GrammarStream:
-    """Endless fresh scenes of a grammar, not verified by physics.
+    """Endless fresh scenes of a grammar as the prior encodes them, not verified by physics."""
 
-    Args:
-        grammar: grammar of the scenes.
-        prior: prior that encodes the scenes.
-    """
+    size = 0
 
     def __init__(self, grammar: Grammar, prior: ScenePrior) -> None:
         self.grammar = grammar
         self.prior = prior
-
-    @property
-    def size(self) -> int:
-        """0, because the stream is endless."""
-        return 0
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:
         """See :class:`TrainingData`."""

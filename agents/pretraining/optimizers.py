@@ -38,12 +38,9 @@ def build_optimizer(
 ) -> torch.optim.Optimizer:
     """An optimiser of ``network``; ``rate`` of a parameter group is its share of the learning rate.
 
-    Args:
-        name: ``"adamw"``, or ``"muon"`` for Muon on the matrices inside ``blocks`` and AdamW on the rest.
-        network: network to train.
-        weight_decay: decoupled weight decay.
-        text_rate: ``rate`` of the parameters under ``text_encoder``. At first, only a few percent of the loss depend on
-            prompts; with the full learning rate, all words get the same embedding before the network reads them.
+    ``"muon"`` is Muon on the matrices inside ``blocks`` and AdamW on the rest. ``text_rate`` is the ``rate`` of the
+    parameters under ``text_encoder``: at first, only a few percent of the loss depend on prompts, and with the full
+    learning rate all words get the same embedding before the network reads them.
     """
     if name not in OPTIMIZERS:
         raise unknown_name("optimizer", name, OPTIMIZERS)
@@ -69,13 +66,7 @@ class MuonAdamW(torch.optim.Optimizer):
 
     The update of a matrix is its momentum made orthogonal, scaled so that its root mean square is that of an AdamW
     update (Liu et al. 2025). It is computed in float32, because ``torch.optim.Muon`` iterates in bfloat16, which is
-    very slow on most CPUs.
-
-    Args:
-        matrices: two-dimensional parameters, updated by Muon.
-        others: parameters updated by AdamW.
-        lr: learning rate of both optimisers.
-        weight_decay: decoupled weight decay of both optimisers.
+    very slow on most CPUs. The weight decay is decoupled.
 
     >>> weight = nn.Parameter(torch.eye(2))
     >>> optimizer = MuonAdamW([weight], [], lr=0.1, weight_decay=0.0)

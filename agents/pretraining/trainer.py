@@ -1,4 +1,4 @@
-"""Pretraining loop of a scene prior, with exact resume, logs and model cards."""
+"""Pretraining of a scene prior: the loop with exact resume and logs, and the warm-up of the text encoder."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
 from agents.configuration.composition import MAX_GRADIENT_NORM, config_text, dotted
 from agents.configuration.prior_names import short_name
-from agents.pretraining.initial_prior import TrainingData
+from agents.pretraining.initial_prior import TrainingData, prepare
 from agents.pretraining.optimizers import build_optimizer, learning_rate_at
 from agents.pretraining.settings import WEIGHT_DECAY, PretrainConfig
-from agents.pretraining.setup import prepare
-from agents.pretraining.text_warmup import warm_up_text
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
 from agents.utils.interrupts import Ending, finishing_steps
@@ -33,23 +32,27 @@ from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError
 from scene_envs.files import claimed, sealed, write_json, write_text
+from scene_envs.scene import POSE_FEATURES
 
 logger = logging.getLogger(__name__)
 
 FIELDS = ("step", "loss", "heldout", "gradient_norm", "learning_rate", "seconds")
+"""Columns of ``log.csv``."""
+_MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe")
+"""Keys that may change between a run and its continuation."""
+_RESIDUAL = 512
+"""Number of held-out scenes on which the residual error of the denoiser is measured."""
+_PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+_RATE, _RISE = 3e-3, 0.2
+"""Peak learning rate of the text warm-up, and the share of its steps in which it rises."""
 
 
 class TrainingLog:
-    """Log of a run; each row is written at once.
-
-    Args:
-        directory: folder of ``log.csv``.
-        also: another logger that gets the same rows, see :func:`agents.utils.loggers.make_logger`.
-    """
+    """The file ``log.csv`` in ``directory``, each row written at once; the logger ``also`` gets the same rows."""
 
     def __init__(self, directory: Path, also: RunLogger | None = None) -> None:
         self.directory = directory
-        self._also = RunLogger() if also is None else also
+        self.also = RunLogger() if also is None else also
 
     def begin(self, step: int) -> None:
         """Keep each row up to ``step`` once; remove rows beyond a checkpoint and, with ``step`` 0, of another run."""
@@ -70,10 +73,6 @@ class TrainingLog:
         writer.writerows(kept[number] for number in sorted(kept))
         write_text(path, text.getvalue())
 
-    def close(self) -> None:
-        """Close the other logger."""
-        self._also.close()
-
     def write(self, row: dict[str, float], last_step: int) -> None:
         """Write one row; the time left is estimated from ``last_step``."""
         step, seconds = int(row["step"]), row["seconds"]
@@ -86,7 +85,7 @@ class TrainingLog:
             if fresh:
                 writer.writeheader()
             writer.writerow(row)
-        self._also.log({key: value for key, value in row.items() if key != "step"}, step)
+        self.also.log({key: value for key, value in row.items() if key != "step"}, step)
 
 
 def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> None:
@@ -101,13 +100,6 @@ def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> No
         logger.warning("no pictures of samples: %s", error)
         return
     gallery(list(images), columns=4, captions=captions).save(directory / f"samples-{step:07d}.png")
-
-
-_MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe")
-"""Keys that may change between a run and its continuation."""
-_RESIDUAL = 512
-"""Number of held-out scenes on which the residual error of the denoiser is measured."""
-_PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
 @torch.no_grad()
@@ -177,7 +169,7 @@ class Pretrainer:
             for row in self._steps(end):
                 if self.processes.is_first:
                     self.log.write(row, self.config.iterations)
-        self.log.close()
+        self.log.also.close()
         if self.processes.is_first:
             logger.info("measuring the residual error at 40 noise levels, for the samplers")
         with self._averaged():
@@ -205,7 +197,9 @@ class Pretrainer:
             last = self.step == config.iterations
             row: dict[str, float] = {}
             if self.step % config.logger.evaluate_every == 0 or last:
-                row["heldout"] = self._evaluate()
+                with self._averaged():
+                    row["heldout"] = heldout_loss(self.prior, self.heldout_data.to(config.device))
+                self.evaluations.append({"step": self.step, "heldout": row["heldout"]})
             if self.step % config.logger.log_every == 0 or row:
                 row |= {"step": self.step, "loss": sum(running) / len(running), "gradient_norm": norm}
                 row |= {"learning_rate": learning_rate_at(self.step - 1, config), "seconds": round(self.seconds, 1)}
@@ -271,16 +265,8 @@ class Pretrainer:
             group["initial_lr"] = group["rate"]
         return LambdaLR(self.optimizer, lambda step: learning_rate_at(step, self.config), last_epoch=self.step - 1)
 
-    def _evaluate(self) -> float:
-        with self._averaged():
-            value = heldout_loss(self.prior, self.heldout_data.to(self.config.device))
-        self.evaluations.append({"step": self.step, "heldout": value})
-        return value
-
     def _averaged(self) -> AveragedWeights[nn.Module]:
         return AveragedWeights(self.network, self.average)
-
-    # -- files ----------------------------------------------------------------------------------
 
     def _save(self) -> None:
         if self.processes.is_first:
@@ -300,11 +286,16 @@ class Pretrainer:
 
     def _load(self) -> None:
         state = load_checkpoint(self.checkpoint_path)
-        before = self._started_with(state)
-        if before:
+        before, now = dotted(state["config"]), dotted(asdict(self.config))
+        differing = [
+            f"{key}={value}"
+            for key, value in before.items()
+            if key.partition(".")[0] not in _MAY_DIFFER and value != now.get(key, value)
+        ]
+        if differing:
             raise InvalidInputError(
-                f"{str(self.directory)!r} holds a run that was started with {before}; give the same keys again to "
-                "resume it, or another output"
+                f"{str(self.directory)!r} holds a run that was started with {', '.join(differing)}; give the same keys "
+                "again to resume it, or another output"
             )
         facts, known = self._data_facts(), state.get("data")
         if known is not None and not (
@@ -337,16 +328,6 @@ class Pretrainer:
         heldout = self.heldout_data.double()
         mean = torch.stack([heldout.mean(dim=(0, 1)), heldout.square().mean(dim=(0, 1))])
         return {"scenes": [self.data.size or 0, len(heldout)], "mean": mean}
-
-    def _started_with(self, state: dict[str, Any]) -> str:
-        """Keys of the checkpoint's run whose values differ from this run's; empty if none do."""
-        before, now = dotted(state["config"]), dotted(asdict(self.config))
-        keys = [
-            f"{key}={value}"
-            for key, value in before.items()
-            if key.partition(".")[0] not in _MAY_DIFFER and value != now.get(key, value)
-        ]
-        return ", ".join(keys)
 
     def save_prior(self) -> ScenePrior:
         """Write the prior with averaged weights to ``output/prior``, and return it."""
@@ -389,3 +370,43 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
         write_text(trainer.directory / "config.yaml", sealed(config_text(config)))
         write_json(trainer.directory / "metrics.json", metrics)
         return metrics
+
+
+def warm_up_text(prior: ScenePrior, data: TrainingData, steps: int, batch_size: int, seed: int) -> float | None:
+    """Train the text encoder, and the layers that predict numbers from it, only on prompts and counts of their scenes.
+
+    No scene is denoised, so hundreds of such steps take a minute. The run that follows starts with predicted numbers,
+    from which the network can subtract the visible objects. The prior is changed in place, if it has count
+    conditioning. The same seed gives the same weights.
+
+    Returns:
+        Mean loss of the last tenth of the steps, in nats per kind of object; None if nothing was trained.
+    """
+    conditioning = prior.count_conditioning
+    if conditioning is None or steps < 1:
+        return None
+    parameters = [*prior.denoiser.text_encoder.parameters(), *conditioning.counts_out.parameters()]
+    optimizer = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=0.01)
+
+    def rate(step: int) -> float:
+        done = (step + 1) / steps
+        return done / _RISE if done < _RISE else 0.5 * (1.0 + math.cos(math.pi * (done - _RISE) / (1.0 - _RISE)))
+
+    schedule, losses = LambdaLR(optimizer, rate), []
+    for step in range(steps):
+        generator = derived_generator(seed, step, steps)
+        scenes, prompts = data.draw(batch_size, generator, prompts=True)
+        picks = torch.rand(len(prompts), generator=generator).tolist()
+        texts = [group[int(pick * len(group))] for group, pick in zip(prompts, picks, strict=True)]
+        asked = prior.encode_prompts(texts)[0][:, : conditioning.things]
+        states = scenes[..., POSE_FEATURES:].argmax(dim=-1).to(asked.device)
+        loss = conditioning.count_loss(asked, states).mean()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(parameters, 1.0)
+        optimizer.step()
+        schedule.step()
+        optimizer.zero_grad(set_to_none=True)
+        losses.append(float(loss.detach()))
+    last = losses[-max(1, steps // 10) :]
+    logger.info("numbers are read from prompts at %.3f nats per kind of object after %d steps", np.mean(last), steps)
+    return float(np.mean(last))

@@ -71,16 +71,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def check_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
-    """Raise unless the weights of a checkpoint have the names and shapes of those of ``module``.
-
-    Args:
-        module: the module to restore.
-        tensors: state dict of the module in the checkpoint.
-        path: file of the checkpoint, for the message.
-
-    Raises:
-        InvalidInputError: a tensor is missing, unknown or of another shape.
-    """
+    """Raise InvalidInputError unless the ``tensors`` of a checkpoint have names and shapes of those of ``module``."""
     wanted, found = ({name: x.shape for name, x in each.items()} for each in (module.state_dict(), tensors))
     differing = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
     if differing:

@@ -24,9 +24,8 @@ class Terminated(KeyboardInterrupt):
 def terminable(received: list[int] | None = None) -> Iterator[None]:
     """Context in which SIGTERM raises :class:`Terminated`; outside the main thread it changes nothing.
 
-    Args:
-        received: a list to which the number of each such signal is appended. Compiled code, such as the import of an
-            extension module, may turn the exception into another error; the list then shows that a signal came.
+    The number of each such signal is appended to ``received``. Compiled code, such as the import of an extension
+    module, may turn the exception into another error; the list then shows that a signal came.
     """
 
     def note_and_raise(number: int, frame: FrameType | None) -> None:

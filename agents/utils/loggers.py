@@ -30,14 +30,9 @@ class RunLogger:
 
 
 class TensorBoardRunLogger(RunLogger):
-    """Events for TensorBoard.
-
-    Args:
-        folder: folder of the run; events go into its ``tensorboard/``.
-    """
+    """Events for TensorBoard, in ``tensorboard/`` of the folder of a run."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        _require("tensorboard")
         from torchrl.record.loggers import TensorboardLogger
 
         self._logger: Any = TensorboardLogger(exp_name="tensorboard", log_dir=str(folder))
@@ -53,14 +48,9 @@ class TensorBoardRunLogger(RunLogger):
 
 
 class WandbRunLogger(RunLogger):
-    """A run of Weights & Biases that stays on disk; ``wandb sync`` sends it.
-
-    Args:
-        folder: folder of the run, which also names the run; files go into its ``wandb/``.
-    """
+    """A run of Weights & Biases that stays in ``wandb/`` of the folder of a run; ``wandb sync`` sends it."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        _require("wandb")
         from torchrl.record.loggers import WandbLogger
 
         self._logger: Any = WandbLogger(
@@ -82,28 +72,19 @@ class WandbRunLogger(RunLogger):
 
 
 def make_logger(name: str, folder: str | os.PathLike[str]) -> RunLogger:
-    """The logger ``name`` of the run in ``folder``.
-
-    Args:
-        name: ``"csv"``, ``"tensorboard"`` or ``"wandb"``.
-        folder: folder of the run.
+    """The logger ``name``, one of :data:`LOGGERS`, of the run in ``folder``.
 
     Raises:
         UnknownNameError: no such logger.
         MissingDependencyError: the package of the logger is not installed.
     """
+    if name not in LOGGERS:
+        raise unknown_name("logger", name, LOGGERS)
     if name == "csv":
         return RunLogger()
-    if name == "tensorboard":
-        return TensorBoardRunLogger(folder)
-    if name == "wandb":
-        return WandbRunLogger(folder)
-    raise unknown_name("logger", name, LOGGERS)
-
-
-def _require(package: str) -> None:
-    if importlib.util.find_spec(package) is None:
+    if importlib.util.find_spec(name) is None:
         raise MissingDependencyError(
-            f"logger={package} needs the package {package}, which is not installed: pip install "
-            f"'scene-envs[{package}]', or take logger=csv"
+            f"logger={name} needs the package {name}, which is not installed: pip install "
+            f"'scene-envs[{name}]', or take logger=csv"
         )
+    return (TensorBoardRunLogger if name == "tensorboard" else WandbRunLogger)(folder)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
@@ -54,11 +54,17 @@ class ProcessGroup:
             timeout: seconds that a process waits for the others.
 
         Raises:
-            InvalidInputError: ``WORLD_SIZE`` is set, and the other variables of a launcher are not.
+            InvalidInputError: ``WORLD_SIZE`` is set, and the other variables of a launcher are not; or Accelerate was
+                asked for several processes on a CPU, of which it starts only one.
             TrainingError: the other processes do not join.
         """
         size = launched_processes()
-        _check_accelerate()
+        accelerate = os.environ.get("ACCELERATE_USE_CPU", "").lower() == "true" and "MASTER_ADDR" in os.environ
+        if accelerate and _launched_as("WORLD_SIZE") is None:
+            raise InvalidInputError(
+                "accelerate launch --cpu ignores --num_processes and starts one process; for several on a CPU give "
+                "--multi_gpu in place of --cpu, and device=cpu to the command, or use torchrun"
+            )
         if size == 1:
             return cls()
         for name in _LAUNCHERS:  # torch reads only the names of torchrun
@@ -102,14 +108,6 @@ class ProcessGroup:
                 distributed.all_reduce(value)
         return value
 
-    def sum_tensors(self, values: Sequence[Tensor]) -> list[Tensor]:
-        """The sum over all processes of each tensor, in one message; the tensors have the same dtype."""
-        if self.size == 1 or not values:
-            return list(values)
-        flat = self.sum(torch.cat([value.flatten() for value in values]))
-        parts = flat.split([value.numel() for value in values])
-        return [part.view_as(value).clone() for part, value in zip(parts, values, strict=True)]
-
     def sum_numbers(self, *values: float) -> list[float]:
         """The sum of each number over all processes."""
         return list(values) if self.size == 1 else self.sum(torch.tensor(values, dtype=torch.float64)).tolist()
@@ -129,9 +127,12 @@ class ProcessGroup:
         taken = list(parameters)
         present = self.sum(torch.tensor([float(p.grad is not None) for p in taken])).tolist()
         taken = [p for p, some in zip(taken, present, strict=True) if some]
+        if not taken:
+            return
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in taken]
-        for parameter, total in zip(taken, self.sum_tensors(gradients), strict=True):
-            parameter.grad = total
+        total = self.sum(torch.cat([gradient.flatten() for gradient in gradients]))
+        for parameter, part in zip(taken, total.split([p.numel() for p in taken]), strict=True):
+            parameter.grad = part.view_as(parameter).clone()
 
     def share(self, parameters: Iterable[nn.Parameter]) -> None:
         """Replace the values of every process by those of the first."""
@@ -187,16 +188,6 @@ def is_first_process() -> bool:
 def _launched_as(name: str) -> str | None:
     """The value of a variable of ``torchrun``, or of the corresponding variable of MPI."""
     return next((os.environ[known] for known in (name, *_LAUNCHERS[name]) if known in os.environ), None)
-
-
-def _check_accelerate() -> None:
-    """Raise InvalidInputError if Accelerate was asked for several processes on a CPU, as it starts only one."""
-    asked = os.environ.get("ACCELERATE_USE_CPU", "").lower() == "true" and "MASTER_ADDR" in os.environ
-    if asked and _launched_as("WORLD_SIZE") is None:
-        raise InvalidInputError(
-            "accelerate launch --cpu ignores --num_processes and starts one process; for several on a CPU give "
-            "--multi_gpu in place of --cpu, and device=cpu to the command, or use torchrun"
-        )
 
 
 @contextmanager

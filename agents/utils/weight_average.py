@@ -13,13 +13,10 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class WeightAverage:
-    """Exponential moving average of a module's parameters.
+    """Exponential moving average of a module's parameters, with a final ``decay``.
 
-    Args:
-        module: module to average.
-        decay: final decay.
-        warm_up: updates after which the decay is one half, if the final decay is not reached before; 0 for the final
-            decay from the first update on.
+    After ``warm_up`` updates the decay is one half, unless the final decay is less; with 0 it is final from the first
+    on.
 
     >>> layer = nn.Linear(1, 1)
     >>> average = WeightAverage(layer, decay=0.5)
@@ -45,12 +42,7 @@ class WeightAverage:
 
     @torch.no_grad()
     def restore(self, tensors: Mapping[str, Tensor], updates: int | None = None) -> None:
-        """Take the averages of a checkpoint, on the device of the present ones.
-
-        Args:
-            tensors: averages by the name of their parameter.
-            updates: number of updates that made them; None keeps the present number.
-        """
+        """Take the averages of a checkpoint, and the number of ``updates`` that made them, if it is given."""
         for name, present in self.tensors.items():
             present.copy_(tensors[name])
         self.updates = self.updates if updates is None else updates
@@ -63,12 +55,7 @@ class WeightAverage:
 
 
 class AveragedWeights(Generic[Module]):
-    """Context in which a module has its averaged weights; at the end it gets its own weights back.
-
-    Args:
-        module: module that takes part in the exchange.
-        average: average of the parameters; None leaves the module unchanged.
-    """
+    """Context in which a module has its averaged weights, if there is an ``average``; then it gets its own back."""
 
     def __init__(self, module: Module, average: WeightAverage | None) -> None:
         self.module, self.average = module, average

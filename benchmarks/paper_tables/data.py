@@ -44,7 +44,7 @@ class RowData:
         Raises:
             InvalidInputError: several folders, or scenes of another type.
         """
-        from agents.pretraining.setup import split_heldout
+        from agents.pretraining.initial_prior import split_heldout
 
         if settings.data == "grammar":
             return cls(None, None)
@@ -59,7 +59,7 @@ class RowData:
 
     def prepare(self, config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
         """A fresh prior, its training scenes, and held-out scenes (K, N, D), both as the prior encodes them."""
-        from agents.pretraining.setup import prepare, prepare_from
+        from agents.pretraining.initial_prior import prepare, prepare_from
 
         if self.training is None or self.heldout is None:
             return prepare(config)

@@ -111,6 +111,6 @@ def _prompts(samples: SceneBatch, prompts: Sequence[str]) -> Mapping[str, float]
 
 
 def _chance(real: HeldoutScenes) -> Mapping[str, float]:
-    from agents.evaluation.prompt_following import prompt_chance
+    from agents.evaluation.measure import prompt_chance
 
     return prompt_chance(real.others, real.prompts)

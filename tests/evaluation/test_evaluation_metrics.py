@@ -8,8 +8,15 @@ import pytest
 import torch
 
 from agents.evaluation import grammar_scenes
-from agents.evaluation.layouts import SUPPORTS, Support
-from agents.evaluation.metrics import KL_EPS, category_kl, count_wasserstein, height_errors, workspace_fraction
+from agents.evaluation.layouts import (
+    KL_EPS,
+    SUPPORTS,
+    Support,
+    category_kl,
+    count_wasserstein,
+    height_errors,
+    workspace_fraction,
+)
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from tests.helpers.built_scenes import DIMSUM, build

@@ -20,8 +20,7 @@ from agents.evaluation.pictures import (
     gaussian_distance,
     load_inception,
 )
-from agents.evaluation.set_encoder import SHIPPED, SetEncoder
-from agents.evaluation.set_network import blurred
+from agents.evaluation.set_network import SHIPPED, SetEncoder, blurred
 from benchmarks.set_encoder_training import SetEncoderTraining, damage, train_set_encoder
 from scene_envs.datasets import to_union
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from agents.evaluation import grammar_scenes, own_prompts, prompt_following
-from agents.evaluation.prompt_following import prompt_chance
+from agents.evaluation.measure import prompt_chance
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 

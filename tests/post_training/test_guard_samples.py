@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from agents.evaluation import tallest_stacks
-from agents.evaluation.metrics import count_wasserstein
+from agents.evaluation.layouts import count_wasserstein
 from agents.post_training import post_train
 from agents.post_training.algorithms.forward_process import ForwardProcess
 from agents.post_training.guard import Guard, beyond

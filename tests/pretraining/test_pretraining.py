@@ -12,9 +12,8 @@ from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from agents.cli import main
 from agents.configuration.composition import changed
-from agents.pretraining.initial_prior import SceneTable, build_prior
+from agents.pretraining.initial_prior import SceneTable, build_prior, prepare
 from agents.pretraining.settings import PretrainConfig
-from agents.pretraining.setup import prepare
 from agents.pretraining.trainer import Pretrainer, learning_rate_at
 from agents.priors.testing import tiny_prior
 from agents.utils.seeds import derived_generator

@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from agents.cli import main
-from agents.pretraining.initial_prior import SceneTable
+from agents.pretraining.initial_prior import SceneTable, prepare
 from agents.pretraining.settings import PretrainConfig
-from agents.pretraining.setup import prepare
 from agents.pretraining.trainer import Pretrainer
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior

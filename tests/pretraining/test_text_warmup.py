@@ -11,7 +11,7 @@ import torch
 from agents.configuration.composition import changed as changed_config
 from agents.pretraining.initial_prior import SceneTable, build_prior
 from agents.pretraining.settings import PretrainConfig
-from agents.pretraining.text_warmup import warm_up_text
+from agents.pretraining.trainer import warm_up_text
 from agents.priors.mixed import MixedPrior
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.grammars import get_grammar
