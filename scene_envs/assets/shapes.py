@@ -21,6 +21,12 @@ from scene_envs.errors import InvalidInputError
 
 Profile = Sequence[tuple[float, float]]
 """Points (r, z) of a half section, m."""
+Color = tuple[int, int, int]
+"""(r, g, b) in 0..255."""
+_SMOOTH = np.cos(np.radians(40.0))
+"""Spans of a profile that meet at less than 40 degrees are shaded as one curved surface."""
+Face = Literal["-x", "+x", "-y", "+y", "bottom", "top"]
+FACES: tuple[Face, ...] = ("-x", "+x", "-y", "+y", "bottom", "top")
 
 
 class MassProperties(NamedTuple):
@@ -163,13 +169,6 @@ def mass_properties(parts: Iterable[ConvexPart], mass: float) -> MassProperties:
     return MassProperties(mass, center, 0.5 * (inertia + inertia.T))
 
 
-Color = tuple[int, int, int]
-"""(r, g, b) in 0..255."""
-
-_SMOOTH = np.cos(np.radians(40.0))
-"""Spans of a profile that meet at less than 40 degrees are shaded as one curved surface."""
-
-
 def surface(vertices: ArrayLike, faces: ArrayLike, color: Color, normals: ArrayLike | None = None) -> trimesh.Trimesh:
     """One mesh of one colour; normals (V, 3) default to those of the faces around a vertex."""
     vertices = np.asarray(vertices, dtype=np.float64)
@@ -308,10 +307,6 @@ def arc(points: Sequence[tuple[float, float, float]], samples: int = 16) -> Arra
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
     spline = make_interp_spline(length, knots, k=min(3, len(knots) - 1))
     return np.asarray(spline(np.linspace(0.0, length[-1], samples)))
-
-
-Face = Literal["-x", "+x", "-y", "+y", "bottom", "top"]
-FACES: tuple[Face, ...] = ("-x", "+x", "-y", "+y", "bottom", "top")
 
 
 class Patch(NamedTuple):

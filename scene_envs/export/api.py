@@ -29,6 +29,8 @@ SceneWriter = Callable[["PlacedScene", "AssetFiles", Path], Path]
 
 ENTRY_POINT_GROUP = "scene_envs.export_formats"
 """Packages offer formats under this group: an entry named after the format, whose value is a SceneWriter."""
+_HERE = "scene_envs.export"
+MANIFEST = "export.json"
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,6 @@ class ExportFormat:
         return getattr(import_module(module), function)
 
 
-_HERE = "scene_envs.export"
 _SHIPPED = (
     ExportFormat("urdf", "URDF per asset, poses as JSON", f"{_HERE}.urdf:write_scene"),
     ExportFormat("sdf", "SDF world (Gazebo, Drake)", f"{_HERE}.sdf:write_scene"),
@@ -148,9 +149,6 @@ def check_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     for name in names:
         get_format(name).check()
     return names
-
-
-MANIFEST = "export.json"
 
 
 @dataclass(frozen=True)

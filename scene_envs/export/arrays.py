@@ -12,6 +12,9 @@ from trimesh.exchange.gltf import export_glb
 
 from scene_envs.export.placed import AssetFiles, PlacedScene
 
+Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""World frame (z up) to the frame of glTF (y up)."""
+
 
 def scene_arrays(scene: PlacedScene) -> dict[str, Any]:
     """Arrays of both files, for the n objects of a scene in slot order.
@@ -46,10 +49,6 @@ def write_pickle(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     path = folder / "scene.pkl"
     path.write_bytes(pickle.dumps(scene_arrays(scene), protocol=4))
     return path
-
-
-Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""World frame (z up) to the frame of glTF (y up)."""
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:

@@ -22,6 +22,10 @@ from scene_envs.rotations import matrix_to_quaternion, project_to_so3
 from scene_envs.scene import SceneBatch, require_rigid_poses
 from scene_envs.scene_types import SceneType
 
+_MAX_COLORS = 1024
+_CELL = 4
+"""Width of a colour's cell in the palette, pixels."""
+
 
 @dataclass(frozen=True, eq=False)
 class PlacedObject:
@@ -188,11 +192,6 @@ def number(value: float) -> str:
 def numbers(values: Sequence[float] | Array) -> str:
     """Several numbers as :func:`number` writes them, separated by spaces."""
     return " ".join(number(value) for value in np.asarray(values, dtype=np.float64).ravel())
-
-
-_MAX_COLORS = 1024
-_CELL = 4
-"""Width of a colour's cell in the palette, pixels."""
 
 
 class AssetFiles:

@@ -50,6 +50,12 @@ _SPARE_FACTOR = 3
 ``_SPARE_BODIES``: in every step Bullet compares the boxes of all bodies, including parked ones."""
 _ZERO = (0.0, 0.0, 0.0)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+_LOOK = 12
+"""Number of steps between checks for clusters at rest."""
+_USUAL_ITERATIONS = 35
+"""Solver iterations of a step that costs one unit of work per free object."""
+_STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
+"""An object is at rest when its present speed would take it less far than this (m, rad) in the whole duration."""
 
 
 class BodyPool:
@@ -222,14 +228,6 @@ def _wavefront(hulls: list[Array]) -> str:
         lines.extend(f"f {a + offset} {b + offset} {c + offset}" for a, b, c in ConvexHull(vertices).simplices)
         offset += len(vertices)
     return "\n".join(lines) + "\n"
-
-
-_LOOK = 12
-"""Number of steps between checks for clusters at rest."""
-_USUAL_ITERATIONS = 35
-"""Solver iterations of a step that costs one unit of work per free object."""
-_STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
-"""An object is at rest when its present speed would take it less far than this (m, rad) in the whole duration."""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,14 @@ _BLOCK = 1 << 15
 """Elements of the arrays that hold face-corner or edge-edge combinations at a time (they stay in the cache)."""
 _ROUNDING = 1e-13
 """Sine of an angle, or length (m), that may be a rounding error."""
+TOUCHING = 2e-5
+"""Overlap (m) below which the face-plane bound is taken as the depth, and no exact depth is computed."""
+NEAR = 3e-3
+"""Object pairs are listed when their boxes are at most this far apart (m)."""
+NEAR_FIXED = 0.06
+"""The same limit in height (m) where one of the two is fixed: the fall of an object onto it has a closed form."""
+_TOO_MANY = 20_000_000
+"""Limit of corner tests in the overlapping object pairs of one scene; above it, depths are upper bounds."""
 
 
 class PenetrationDepth:
@@ -298,16 +306,6 @@ def _blocks(work: Index, limit: int) -> Iterator[slice]:
         end = max(start + 1, int(np.searchsorted(total, done + limit, side="right")))
         yield slice(start, end)
         start = end
-
-
-TOUCHING = 2e-5
-"""Overlap (m) below which the face-plane bound is taken as the depth, and no exact depth is computed."""
-NEAR = 3e-3
-"""Object pairs are listed when their boxes are at most this far apart (m)."""
-NEAR_FIXED = 0.06
-"""The same limit in height (m) where one of the two is fixed: the fall of an object onto it has a closed form."""
-_TOO_MANY = 20_000_000
-"""Limit of corner tests in the overlapping object pairs of one scene; above it, depths are upper bounds."""
 
 
 class Collider:

@@ -19,6 +19,18 @@ _WALL_OVERLAP = 5e-4
 """Overlap (m) with a wall next to an object at which the wall does not support the object."""
 _WALL = 1e-2
 """Vertical component of a face normal up to which the face counts as a wall."""
+_DEEP = 5e-4
+"""Overlap (m) up to which two objects are not moved; feasible objects may overlap by 1e-3 m."""
+_FLOATING = 3e-4
+"""Height (m) up to which an object counts as standing."""
+_FALL = 0.03
+"""An object higher than this (m) above all others is not moved down."""
+_MIN_SPREAD = 0.02
+"""Smallest standard deviation along an axis, as a share of the largest one."""
+_LEVEL = np.array([1.0, 1.0, 50.0])
+"""Cost of moving furniture by a metre along each axis: vertical moves are avoided."""
+_CHUNK = 16
+"""Scenes whose overlaps are found together."""
 
 
 def falls(collider: Collider, objects: Objects, limit: float) -> Array:
@@ -73,20 +85,6 @@ def _rooms(collider: Collider, objects: Objects, upper: Index, lower: Index, lim
         meets = ~at_wall & (enter < leave) & (leave > 0)
         np.minimum.at(room, pair[rows[meets]], np.maximum(enter[meets], 0.0))
     return room
-
-
-_DEEP = 5e-4
-"""Overlap (m) up to which two objects are not moved; feasible objects may overlap by 1e-3 m."""
-_FLOATING = 3e-4
-"""Height (m) up to which an object counts as standing."""
-_FALL = 0.03
-"""An object higher than this (m) above all others is not moved down."""
-_MIN_SPREAD = 0.02
-"""Smallest standard deviation along an axis, as a share of the largest one."""
-_LEVEL = np.array([1.0, 1.0, 50.0])
-"""Cost of moving furniture by a metre along each axis: vertical moves are avoided."""
-_CHUNK = 16
-"""Scenes whose overlaps are found together."""
 
 
 def corrections(batch: SceneBatch, spread: Array, movable: Mask | None = None) -> Tensor:

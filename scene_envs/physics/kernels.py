@@ -19,6 +19,7 @@ from scene_envs.scene_types import SceneType
 _LOGGER = logging.getLogger(__name__)
 _FALLEN = 1.0
 """Objects further than this (m) below the workspace have fallen off, and are simulated no further."""
+Kernel = Callable[..., dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,6 @@ class Chunk:
         rows = slice(index, index + 1)
         units = None if self.units is None else self.units[rows]
         return Chunk(self.scene_type, self.translations[rows], self.rotations[rows], self.categories[rows], units)
-
-
-Kernel = Callable[..., dict[str, Any]]
 
 
 def _is_heap(physics: Physics, objects: Objects) -> bool:

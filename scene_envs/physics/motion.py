@@ -36,6 +36,10 @@ _LONG, _CREEP = 1.0, 1e-2
 again with ``CONVERGED`` iterations."""
 _DAMPING = 0.3
 """Fraction of velocity that objects lose per second while they settle."""
+_SEGMENT = 0.25
+"""Length (s) of a segment; after each, settling chooses the shapes again and checks whether anything still moves."""
+_STILL, _STILL_ANGLE = 5e-5, 5e-4
+"""An object that moved less than this (m, rad) in a segment has come to rest."""
 
 
 class Physics:
@@ -258,12 +262,6 @@ def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, sec
 def settings_for(height: int) -> SolverSettings:
     """Solver settings of a stack whose topmost object stands on ``height`` others: taller stacks get finer steps."""
     return FINEST if height >= _HIGH else SolverSettings(1.0 / 480.0, ITERATIONS)
-
-
-_SEGMENT = 0.25
-"""Length (s) of a segment; after each, settling chooses the shapes again and checks whether anything still moves."""
-_STILL, _STILL_ANGLE = 5e-5, 5e-4
-"""An object that moved less than this (m, rad) in a segment has come to rest."""
 
 
 def settle_scene(

@@ -16,6 +16,21 @@ from scene_envs.assets.base import Asset, ConvexPart
 
 SIZE_CLASSES = ((8, 6), (16, 16), (32, 24))
 """(corners, face directions) up to which parts share padded arrays; larger parts make a last class."""
+GRAVITY = 9.81
+"""m/s^2."""
+FRICTION = 0.6
+"""Coulomb friction coefficient between any two objects."""
+_FACE_TOLERANCE = 1e-5
+"""Corners this close (m) to the extreme height belong to the face."""
+_SAME_AREA = 1e-3
+"""Relative difference of areas below which a face has no hole."""
+_SAME_NORMAL = 1e-10
+"""Faces whose unit normals differ by less than this are one face."""
+_MIN_EXTENT = 1e-12
+"""Relative size below which a part is a point, width below which a flat part is a line, and height that counts as 0."""
+_CONTAINED = 1e-6
+"""A corner of a fine part up to this far (m) outside a coarse part still counts as inside."""
+Records = TypeVar("Records", bound="Rows")
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,18 +62,6 @@ class PartGeometry:
             if len(self.vertices) <= corners and len(self.normals) <= directions:
                 return index
         return len(SIZE_CLASSES)
-
-
-GRAVITY = 9.81
-"""m/s^2."""
-FRICTION = 0.6
-"""Coulomb friction coefficient between any two objects."""
-
-
-_FACE_TOLERANCE = 1e-5
-"""Corners this close (m) to the extreme height belong to the face."""
-_SAME_AREA = 1e-3
-"""Relative difference of areas below which a face has no hole."""
 
 
 @dataclass(frozen=True)
@@ -128,12 +131,6 @@ def _outside(points: Array, polygon: Array) -> Array:
     edge = np.roll(polygon, -1, axis=0) - polygon
     normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     return ((points[:, None] - polygon[None]) * normal[None]).sum(axis=2).max(axis=1)
-
-
-_SAME_NORMAL = 1e-10
-"""Faces whose unit normals differ by less than this are one face."""
-_MIN_EXTENT = 1e-12
-"""Relative size below which a part is a point, width below which a flat part is a line, and height that counts as 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,10 +211,6 @@ def _distinct(normals: Array) -> tuple[Array, Index]:
             group[index] = group[int(near.argmax())]
     kept, number = np.unique(group, return_inverse=True)
     return exact[kept], number.ravel()[face]
-
-
-_CONTAINED = 1e-6
-"""A corner of a fine part up to this far (m) outside a coarse part still counts as inside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,9 +394,6 @@ def principal_inertia(inertia: Array) -> tuple[Array, Array]:
     if np.linalg.det(axes) < 0:
         axes[:, 0] *= -1.0
     return moments, axes
-
-
-Records = TypeVar("Records", bound="Rows")
 
 
 class Rows:

@@ -14,6 +14,20 @@ from scene_envs.physics.parts import SIZE_CLASSES, LevelGeometry, LibraryGeometr
 _CLASSES = len(SIZE_CLASSES) + 1
 _BLOCK = 1 << 16
 """Face-corner combinations computed together: their arrays stay in the cache."""
+Level = Literal["fine", "coarse"]
+PER_SCENE, PER_OBJECT, PER_PAIR, MAX_PER_OBJECT = 1_000.0, 1_200.0, 500.0, 10_000.0
+"""Units of simulation (see :class:`Budget`) that a scene may take: ``PER_SCENE``, plus ``PER_OBJECT`` for each free
+object, plus ``PER_PAIR`` for each pair of free objects, because they may meet. The sum of the last two is at most
+``MAX_PER_OBJECT`` for each free object."""
+MIN_UNITS = 20_000.0
+"""Smallest number of units beyond ``PER_SCENE``, unless ``MAX_PER_OBJECT`` gives fewer. It lets a scene of five
+objects go through all rounds of :func:`~scene_envs.physics.make_ready`."""
+_CROWDED = 0.75
+"""Above this share of free objects that do not stand clear of each other, a scene gets only ``PER_SCENE`` units."""
+_COINCIDENT = 0.9
+"""Two objects coincide when the common part of their boxes is at least this share of the larger box."""
+_DEEP = 1e-2
+"""A free object does not stand clear when it is deeper than this (m) in another free one, or coincides with one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +150,6 @@ def _along(directions: Array, vector: Array) -> Array:
     """(P, K) m: components of vectors (P, 3) along directions (P, K, 3)."""
     x, y, z = vector[:, None, 0], vector[:, None, 1], vector[:, None, 2]
     return directions[..., 0] * x + directions[..., 1] * y + directions[..., 2] * z  # type: ignore[no-any-return]
-
-
-Level = Literal["fine", "coarse"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,21 +280,6 @@ class ObjectPairs:
         np.maximum.at(depth, self.first, self.depth)
         np.maximum.at(depth, self.second, self.depth)
         return depth
-
-
-PER_SCENE, PER_OBJECT, PER_PAIR, MAX_PER_OBJECT = 1_000.0, 1_200.0, 500.0, 10_000.0
-"""Units of simulation (see :class:`Budget`) that a scene may take: ``PER_SCENE``, plus ``PER_OBJECT`` for each free
-object, plus ``PER_PAIR`` for each pair of free objects, because they may meet. The sum of the last two is at most
-``MAX_PER_OBJECT`` for each free object."""
-MIN_UNITS = 20_000.0
-"""Smallest number of units beyond ``PER_SCENE``, unless ``MAX_PER_OBJECT`` gives fewer. It lets a scene of five
-objects go through all rounds of :func:`~scene_envs.physics.make_ready`."""
-_CROWDED = 0.75
-"""Above this share of free objects that do not stand clear of each other, a scene gets only ``PER_SCENE`` units."""
-_COINCIDENT = 0.9
-"""Two objects coincide when the common part of their boxes is at least this share of the larger box."""
-_DEEP = 1e-2
-"""A free object does not stand clear when it is deeper than this (m) in another free one, or coincides with one."""
 
 
 @dataclass

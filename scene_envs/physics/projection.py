@@ -43,6 +43,60 @@ _ITERATIONS = 1e8
 """Matrix entries that the exact method may visit."""
 _ROWS_SQUARED = 25.0
 """A least-distance problem costs the square of its number of rows, divided by this, in units of work."""
+_AROUND = 0.06
+"""Parts further apart than this (m) are ignored when a translation is measured."""
+_OWN = 4
+"""Face directions tried per object pair from its deepest parts, and from its shallowest, besides the common ones."""
+_MAX_WALK_STEPS = 6
+"""Largest number of steps of a walk; each step leaves one overlapping part."""
+_DOWN = 3.0
+"""Cost factor of a translation down, out of a fixed object: an object that lies in a board belongs on it."""
+_UP = 1.4
+"""Cost factor of a vertical translation of two free objects: the lower one rests on something and cannot share it."""
+_BLOCKED = 20.0
+"""Cost factor of a translation that leaves the workspace or ends in a fixed object."""
+_REPEATED = 2.5
+"""Cost factor of a direction for each time that it was tried and did not help."""
+_SAME_DIRECTION = 0.7
+"""Cosine above which two directions count as the same."""
+_AXES = np.concatenate([np.eye(3), -np.eye(3)])
+Tried = dict[tuple[int, int], list[Array]]
+"""The directions tried for each object pair so far."""
+_HEAP = 3_000_000
+"""A group of objects whose boxes meet may be a heap when it takes more corner tests than this."""
+_DEEP = 5e-3
+"""Such a group is a heap when objects whose boxes have most in common overlap deeper than this (m)."""
+_LOOKED_AT = 3
+"""Number of object pairs measured for this: those whose common box is the largest share of the smaller box."""
+_WINDOWS = (0.3, 1.0, 4.0, 20.0)
+"""Half widths (m) of the cubes around a wanted place that are searched, one after the other."""
+_BINS = 16
+"""Coordinates tested along each axis come from this many equal intervals, at most two from each."""
+_FIXED = 1000
+"""Overlapping a box of a fixed object counts as much as overlapping this many free objects."""
+Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
+TOLERANCE = 1e-4
+"""Depth (m) up to which a projected scene counts as free of overlap."""
+WORK = 10_000.0
+"""Units of work (pairs of convex parts, or rows solved) until a search ends."""
+SEARCHES = 5
+"""Limit of searches per scene: the first from the given poses, the others after overlapping objects were spread."""
+_OVERLAPPING = 2_000_000
+"""Limit of corner tests in overlapping object pairs; more are too much work for minimum translations."""
+_ROUNDS = 30
+"""Largest number of rounds of a search; objects that still overlap after them are not moved further."""
+_PATIENCE = 10
+"""A search also ends after more rounds than this without any improvement."""
+_REFINEMENTS = 8
+"""Largest number of rounds spent on shortening the distances moved in a scene that is free of overlap."""
+_GAIN = 0.005
+"""Relative decrease of the squared distances moved from which another refinement is made."""
+_NEGLIGIBLE = 1e-8
+"""Sum of squared distances moved (m^2) below which no refinement is made."""
+_INSIDE = 1e-5
+"""Objects stay this far (m) inside the workspace, so that rounding does not take them out."""
+_OUTSIDE = 0.05
+"""Objects further than this (m) outside the workspace are no part of the arrangement and are not moved back inside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,28 +272,6 @@ def _approximate(matrix: Array, needed: Array) -> Array:
         ahead = new + (momentum - 1.0) / following * (new - multipliers)
         multipliers, momentum = new, following
     return transposed @ multipliers  # type: ignore[no-any-return]
-
-
-_AROUND = 0.06
-"""Parts further apart than this (m) are ignored when a translation is measured."""
-_OWN = 4
-"""Face directions tried per object pair from its deepest parts, and from its shallowest, besides the common ones."""
-_MAX_WALK_STEPS = 6
-"""Largest number of steps of a walk; each step leaves one overlapping part."""
-_DOWN = 3.0
-"""Cost factor of a translation down, out of a fixed object: an object that lies in a board belongs on it."""
-_UP = 1.4
-"""Cost factor of a vertical translation of two free objects: the lower one rests on something and cannot share it."""
-_BLOCKED = 20.0
-"""Cost factor of a translation that leaves the workspace or ends in a fixed object."""
-_REPEATED = 2.5
-"""Cost factor of a direction for each time that it was tried and did not help."""
-_SAME_DIRECTION = 0.7
-"""Cosine above which two directions count as the same."""
-_AXES = np.concatenate([np.eye(3), -np.eye(3)])
-
-Tried = dict[tuple[int, int], list[Array]]
-"""The directions tried for each object pair so far."""
 
 
 def minimum_translations(
@@ -430,20 +462,6 @@ def _weights(
     return weight
 
 
-_HEAP = 3_000_000
-"""A group of objects whose boxes meet may be a heap when it takes more corner tests than this."""
-_DEEP = 5e-3
-"""Such a group is a heap when objects whose boxes have most in common overlap deeper than this (m)."""
-_LOOKED_AT = 3
-"""Number of object pairs measured for this: those whose common box is the largest share of the smaller box."""
-_WINDOWS = (0.3, 1.0, 4.0, 20.0)
-"""Half widths (m) of the cubes around a wanted place that are searched, one after the other."""
-_BINS = 16
-"""Coordinates tested along each axis come from this many equal intervals, at most two from each."""
-_FIXED = 1000
-"""Overlapping a box of a fixed object counts as much as overlapping this many free objects."""
-
-
 def heaps(collider: Collider, objects: Objects) -> Mask:
     """(n,) free objects of one scene in groups that overlap so much that exact tests would take too long.
 
@@ -544,32 +562,6 @@ def _lines(faces: Array, wanted: float, start: float, end: float) -> Array:
     highest = np.searchsorted(bins, np.arange(_BINS), "right") - 1
     used = highest >= lowest
     return np.unique(np.concatenate([[wanted, start, end], inside[lowest[used]], inside[highest[used]]]))
-
-
-Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
-
-TOLERANCE = 1e-4
-"""Depth (m) up to which a projected scene counts as free of overlap."""
-WORK = 10_000.0
-"""Units of work (pairs of convex parts, or rows solved) until a search ends."""
-SEARCHES = 5
-"""Limit of searches per scene: the first from the given poses, the others after overlapping objects were spread."""
-_OVERLAPPING = 2_000_000
-"""Limit of corner tests in overlapping object pairs; more are too much work for minimum translations."""
-_ROUNDS = 30
-"""Largest number of rounds of a search; objects that still overlap after them are not moved further."""
-_PATIENCE = 10
-"""A search also ends after more rounds than this without any improvement."""
-_REFINEMENTS = 8
-"""Largest number of rounds spent on shortening the distances moved in a scene that is free of overlap."""
-_GAIN = 0.005
-"""Relative decrease of the squared distances moved from which another refinement is made."""
-_NEGLIGIBLE = 1e-8
-"""Sum of squared distances moved (m^2) below which no refinement is made."""
-_INSIDE = 1e-5
-"""Objects stay this far (m) inside the workspace, so that rounding does not take them out."""
-_OUTSIDE = 0.05
-"""Objects further than this (m) outside the workspace are no part of the arrangement and are not moved back inside."""
 
 
 @dataclass(frozen=True, eq=False)

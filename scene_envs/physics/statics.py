@@ -31,6 +31,16 @@ _TOUCHING = 1e-4
 """Overlap (m) with a neighbouring object that is too small to move an object."""
 _DEEPEST = 2e-3
 """An object that is sunk deeper than this (m) into its support does not simply rise."""
+_REACH = 2e-3
+"""Pairs further apart than this (m) do not carry each other."""
+_SAME_DEPTH = 1e-4
+"""Coarse and fine overlap may differ by this much (m) and still act alike."""
+_UPRIGHT = 0.999
+"""Cosine of the tilt up to which faces count as facing each other."""
+_CLEAR = 0.01
+_CLEAR_ABOVE = 0.06
+"""Objects are simulated in one cluster when they are within ``_CLEAR`` (m) of each other sideways and within
+``_CLEAR_ABOVE`` (m) in height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,18 +281,6 @@ def _rim(asset: AssetGeometry) -> tuple[float, Array] | None:
     vertices = asset.fine.vertices
     outline = _outline(vertices[vertices[:, 2] > asset.top.height - 1e-5][:, :2])
     return None if outline is None else (asset.top.height, outline)
-
-
-_REACH = 2e-3
-"""Pairs further apart than this (m) do not carry each other."""
-_SAME_DEPTH = 1e-4
-"""Coarse and fine overlap may differ by this much (m) and still act alike."""
-_UPRIGHT = 0.999
-"""Cosine of the tilt up to which faces count as facing each other."""
-_CLEAR = 0.01
-_CLEAR_ABOVE = 0.06
-"""Objects are simulated in one cluster when they are within ``_CLEAR`` (m) of each other sideways and within
-``_CLEAR_ABOVE`` (m) in height."""
 
 
 @dataclass(frozen=True, eq=False)

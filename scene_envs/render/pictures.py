@@ -42,6 +42,7 @@ _SUPERSAMPLING = 2
 _STYLES = ("picture", "semantic")
 _TABLE = 0.68
 """Radius (m) of the framing of a dim sum table, for which contact shading is tuned."""
+_PAGE, _INK = (255, 255, 255), (58, 62, 70)
 
 
 def render(
@@ -151,9 +152,6 @@ def _picture(
     image = np.where((frame.slots >= 0)[..., None], lit, backdrop)
     small = image.reshape(height, scale, width, scale, 3).mean(axis=(1, 3))
     return np.rint(np.clip(small, 0.0, 255.0)).astype(np.uint8)
-
-
-_PAGE, _INK = (255, 255, 255), (58, 62, 70)
 
 
 def gallery(

@@ -24,6 +24,14 @@ from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_typ
 _AWAY = (0.0, 0.0, -1000.0)
 _CELL, _CELLS = 8, 32
 """The palette texture: 32 x 32 cells of 8 pixels, one per colour."""
+_SIDES = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_TOP = np.array([0.0, 0.0, 1.0])
+_RAYS = 24
+_FOV = 28.0
+_MARGIN = 0.05
+_LAMP_PIXELS = 512, 1024
+"""Resolution of the lamp's depth image for framings of a radius up to 2 m, and for larger ones."""
+Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -198,11 +206,6 @@ def _color_codes(asset: Asset) -> NDArray[np.int64]:
     return (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]
 
 
-_SIDES = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-_TOP = np.array([0.0, 0.0, 1.0])
-_RAYS = 24
-
-
 @dataclass(frozen=True, eq=False)
 class Framing:
     """Points to show, with the directions of camera and lamp."""
@@ -362,12 +365,6 @@ def _direction(azimuth: float, elevation: float) -> Array:
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
-_FOV = 28.0
-_MARGIN = 0.05
-_LAMP_PIXELS = 512, 1024
-"""Resolution of the lamp's depth image for framings of a radius up to 2 m, and for larger ones."""
-
-
 def picture_camera(scene_type: str | SceneType, width: int = 480, height: int = 360) -> Camera:
     """The three-quarter view of pictures without a given camera.
 
@@ -402,9 +399,6 @@ def light_camera(scene_type: SceneType) -> Camera:
 
 def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
     return (float(vector[0]), float(vector[1]), float(vector[2]))
-
-
-Image = NDArray[np.float32]
 
 
 def camera_points(frame: Frame) -> Image:

@@ -51,6 +51,26 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 AXES: tuple[Axis, ...] = ("x", "y", "z", "-x", "-y", "-z")
 Base = Literal["bottom", "origin"]
 BASES: tuple[Base, ...] = ("bottom", "origin")
+_TEXTS = ("file", "name", "display_name", "plural")
+_NUMBERS = ("scale", "density", "mass", "concavity")
+_CHOICES: Mapping[str, tuple[str, ...]] = {"up": AXES, "base": BASES, "decomposition": METHODS}
+DEFAULT_DENSITY = 500.0
+"""Density (kg/m^3) used where neither the file nor the user gives one: wood, or a ceramic vessel with its air."""
+_POSSIBLE = (1.0, 23_000.0)
+"""Possible densities, kg/m^3, from air to osmium."""
+_FACTOR = 10.0
+"""Largest factor between a moment of inertia and that of the same shape filled evenly."""
+_CONVEX = 0.01
+"""Depth below the hull, as a fraction of the diagonal, up to which a body counts as convex."""
+_MAX_CONVEX = 2e-3
+"""Upper limit (m) of that depth."""
+_THIN = 3e-3
+"""Parts thinner than this (m) get a note: the collision margins of physics engines take up much of them."""
+_MANY_PARTS, _MANY_TRIANGLES = 64, 200_000
+_UNLIKE = 0.01
+"""Difference (m) between the bounding boxes of visual and collision geometry that is worth a note."""
+_SMALL, _LARGE = 2e-3, 20.0
+"""Smallest and largest plausible diagonal (m); beyond them the file is probably not in metres."""
 
 
 @dataclass(frozen=True)
@@ -95,11 +115,6 @@ class AssetEntry(AssetNames):
     base: Base = "bottom"
     decomposition: Method = "auto"
     concavity: float = 0.05
-
-
-_TEXTS = ("file", "name", "display_name", "plural")
-_NUMBERS = ("scale", "density", "mass", "concavity")
-_CHOICES: Mapping[str, tuple[str, ...]] = {"up": AXES, "base": BASES, "decomposition": METHODS}
 
 
 def read_entries(path: Path) -> list[AssetEntry]:
@@ -210,14 +225,6 @@ def _color(value: Any, where: str) -> Color:
     if is_list and all(isinstance(v, int) and not isinstance(v, bool) and 0 <= v <= 255 for v in value):
         return (value[0], value[1], value[2])
     raise InvalidInputError(f"{where}: color must be [r, g, b] in 0..255 or '#rrggbb', got {value!r}")
-
-
-DEFAULT_DENSITY = 500.0
-"""Density (kg/m^3) used where neither the file nor the user gives one: wood, or a ceramic vessel with its air."""
-_POSSIBLE = (1.0, 23_000.0)
-"""Possible densities, kg/m^3, from air to osmium."""
-_FACTOR = 10.0
-"""Largest factor between a moment of inertia and that of the same shape filled evenly."""
 
 
 class Weight(NamedTuple):
@@ -359,19 +366,6 @@ class ImportReport:
 
     def __str__(self) -> str:
         return "\n".join([f"{self.folder}: {len(self.assets)} assets", *self.notes, *map(str, self.assets)])
-
-
-_CONVEX = 0.01
-"""Depth below the hull, as a fraction of the diagonal, up to which a body counts as convex."""
-_MAX_CONVEX = 2e-3
-"""Upper limit (m) of that depth."""
-_THIN = 3e-3
-"""Parts thinner than this (m) get a note: the collision margins of physics engines take up much of them."""
-_MANY_PARTS, _MANY_TRIANGLES = 64, 200_000
-_UNLIKE = 0.01
-"""Difference (m) between the bounding boxes of visual and collision geometry that is worth a note."""
-_SMALL, _LARGE = 2e-3, 20.0
-"""Smallest and largest plausible diagonal (m); beyond them the file is probably not in metres."""
 
 
 def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:

@@ -24,6 +24,26 @@ if TYPE_CHECKING:
 
 Color = tuple[int, int, int]
 Kind = Literal["mesh", "box", "cylinder", "sphere", "capsule", "ellipsoid"]
+MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+"""Mesh files that can be read."""
+_GREY: Color = (176, 176, 170)
+_UNSET = (102, 102, 102)
+"""Colour that trimesh gives a mesh with texture coordinates and no material."""
+_SMOOTH = float(np.cos(np.radians(40.0)))
+"""Faces that meet at less than 40 degrees are shaded as one curved surface."""
+_MAX_SMOOTHED = 100_000
+"""Largest number of triangles of a mesh whose corners are smoothed."""
+_FINE_TEXTURE, _TEXTURE_COLORS = 500, 32
+"""Smallest number of triangles that a textured mesh is cut into, and largest number of its colours."""
+_MAX_PIXELS = 8192 * 8192
+"""Largest number of pixels of a texture."""
+_SAMPLES = np.array(
+    [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)], dtype=np.float64
+) / 4.0  # fmt: skip
+"""Barycentric points (15, 3) at which a texture is read to colour a triangle."""
+_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_PREFIXED = re.compile(rb"(</?)([A-Za-z_][\w.-]*):([A-Za-z_][\w.-]*)")
+"""An element with a namespace prefix, such as <drake:declare_convex/>."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,27 +113,6 @@ def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
         arm = inertial.center_of_mass - center
         total += inertial.inertia + inertial.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     return Inertial(mass, center, total)
-
-
-MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-"""Mesh files that can be read."""
-
-_GREY: Color = (176, 176, 170)
-_UNSET = (102, 102, 102)
-"""Colour that trimesh gives a mesh with texture coordinates and no material."""
-_SMOOTH = float(np.cos(np.radians(40.0)))
-"""Faces that meet at less than 40 degrees are shaded as one curved surface."""
-_MAX_SMOOTHED = 100_000
-"""Largest number of triangles of a mesh whose corners are smoothed."""
-_FINE_TEXTURE, _TEXTURE_COLORS = 500, 32
-"""Smallest number of triangles that a textured mesh is cut into, and largest number of its colours."""
-_MAX_PIXELS = 8192 * 8192
-"""Largest number of pixels of a texture."""
-_SAMPLES = np.array(
-    [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)], dtype=np.float64
-) / 4.0  # fmt: skip
-"""Barycentric points (15, 3) at which a texture is read to colour a triangle."""
-_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def read_mesh(path: Path) -> list[trimesh.Trimesh]:
@@ -337,10 +336,6 @@ def _corner_normals(mesh: trimesh.Trimesh) -> Array:
     length = np.linalg.norm(total, axis=1, keepdims=True)
     smooth = np.divide(total, length, out=own.copy(), where=length > 0)
     return smooth.reshape(-1, 3, 3)
-
-
-_PREFIXED = re.compile(rb"(</?)([A-Za-z_][\w.-]*):([A-Za-z_][\w.-]*)")
-"""An element with a namespace prefix, such as <drake:declare_convex/>."""
 
 
 def read_xml(path: Path) -> Element:

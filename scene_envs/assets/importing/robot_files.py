@@ -26,6 +26,7 @@ from scene_envs.assets.importing.mesh_files import (
 from scene_envs.errors import CorruptFileError, InvalidInputError
 
 _RADII = {"cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sphere": ("radius",)}
+_ZERO = (0.0, 0.0, 0.0)
 
 
 def read_sdf(path: Path) -> Model:
@@ -173,9 +174,6 @@ def _sdf_inertial(element: Element, path: Path, where: str) -> Inertial:
 
 def _flag(text: str | None) -> bool:
     return (text or "").strip().lower() in ("1", "true")
-
-
-_ZERO = (0.0, 0.0, 0.0)
 
 
 def read_urdf(path: Path) -> Model:

@@ -35,6 +35,19 @@ _COARSE_CORNERS = 16
 """Corners of the inner hull whose faces are moved outward to make an enclosing hull."""
 _DIRECTIONS = np.array(list(np.ndindex(3, 3, 3)), dtype=np.float64) - 1.0
 """Directions to the 26 neighbours of a cell, and the zero vector."""
+Method = Literal["auto", "coacd", "convex"]
+METHODS: tuple[Method, ...] = ("auto", "coacd", "convex")
+_LOGGER = logging.getLogger(__name__)
+_VERSION = 2
+"""Version of the format on disk."""
+_SNAP_DISTANCE = 0.015
+"""Largest distance from the true surface, relative to the size of the body, at which corners are moved onto it. CoACD
+rebuilds surfaces that are not closed on a grid; moving the corners keeps flat faces flat."""
+_MAX_BODIES = 128
+"""Largest number of bodies of one mesh that are decomposed one by one."""
+_SEGMENTS = 16
+_CAP = np.radians(15.0)
+"""Half angle of the flat faces at the poles of a ball, on which it can stand."""
 
 
 def few_cornered_hull(points: Array, tolerance: float, corners: int = MAX_CORNERS) -> tuple[ConvexPart, float]:
@@ -106,18 +119,6 @@ def has_volume(points: Array) -> bool:
         return False
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[2] > 1e-6 * max(spread[0], 1e-300))
-
-
-Method = Literal["auto", "coacd", "convex"]
-METHODS: tuple[Method, ...] = ("auto", "coacd", "convex")
-_LOGGER = logging.getLogger(__name__)
-_VERSION = 2
-"""Version of the format on disk."""
-_SNAP_DISTANCE = 0.015
-"""Largest distance from the true surface, relative to the size of the body, at which corners are moved onto it. CoACD
-rebuilds surfaces that are not closed on a grid; moving the corners keeps flat faces flat."""
-_MAX_BODIES = 128
-"""Largest number of bodies of one mesh that are decomposed one by one."""
 
 
 def cache_folder() -> Path:
@@ -328,11 +329,6 @@ def _write(path: Path, pieces: Sequence[Array]) -> None:
             np.savez(file, vertices=np.concatenate(pieces), counts=np.array([len(piece) for piece in pieces]))
     except OSError as error:
         _LOGGER.warning("a decomposition could not be kept in %s: %s", path.parent, error)
-
-
-_SEGMENTS = 16
-_CAP = np.radians(15.0)
-"""Half angle of the flat faces at the poles of a ball, on which it can stand."""
 
 
 class Collision(NamedTuple):
