@@ -284,16 +284,13 @@ def feasibility(
             limit is negative or NaN, or the duration is not a positive number.
         MissingDependencyError: pybullet is not installed.
     """
-    check_numbers(
-        duration, max_penetration=max_penetration, max_displacement=max_displacement, max_rotation=max_rotation
-    )
-    options = {
+    limits = {
         "max_penetration": max_penetration,
         "max_displacement": max_displacement,
         "max_rotation": max_rotation,
-        "duration": duration,
     }
-    rows = run_kernel("feasibility", batch, options, pool)
+    check_numbers(duration, **limits)
+    rows = run_kernel("feasibility", batch, limits | {"duration": duration}, pool)
     feasible = stack(rows, batch, "feasible", torch.bool) & batch.in_workspace.cpu()
     return FeasibilityResult(
         feasible=feasible,

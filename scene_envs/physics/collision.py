@@ -322,9 +322,14 @@ class Collider:
         """
         coarse = place(self.library, objects, "coarse")
         low, high = object_boxes(coarse)
-        first, second = _near_pairs(objects, low, high)
-        contacts, gap, direction, keep = self._coarse_gaps(objects, coarse, first, second)
-        first, second, gap, direction = first[keep], second[keep], gap[keep], direction[keep]
+        first, second = scene_pairs(objects)
+        near = _boxes_near(low, high, first, second, NEAR, objects.fixed[first] | objects.fixed[second])
+        first, second = first[near], second[near]
+        contacts, pair = self._near_parts(objects, coarse, first, second, *part_pairs(coarse, first, second))
+        order = np.lexsort((contacts.gap, pair))
+        keep, leading = np.unique(pair[order], return_index=True)
+        best = order[leading]  # the contact with the smallest gap of each pair
+        first, second, gap, direction = first[keep], second[keep], contacts.gap[best], contacts.direction[best]
         depth, total = np.zeros(len(first)), np.zeros(len(first))
         part_count = np.zeros(len(first), dtype=np.int64)
         overlapping = np.flatnonzero(gap < 0)
@@ -360,19 +365,6 @@ class Collider:
         gap, direction = separations(self.library, placed.parts, a, b)
         part = placed.parts.part
         return Contacts(first[pair], second[pair], part[a], part[b], gap, direction), pair
-
-    def _coarse_gaps(
-        self, objects: Objects, coarse: PlacedObjects, first: Index, second: Index
-    ) -> tuple[Contacts, Array, Array, Index]:
-        pair, a, b = part_pairs(coarse, first, second)
-        contacts, pair = self._near_parts(objects, coarse, first, second, pair, a, b)
-        gap = np.full(len(first), np.inf)
-        direction = np.zeros((len(first), 3))
-        order = np.lexsort((contacts.gap, pair))
-        keep, leading = np.unique(pair[order], return_index=True)
-        best = order[leading]
-        gap[keep], direction[keep] = contacts.gap[best], contacts.direction[best]
-        return contacts, gap, direction, keep
 
     def _fine_depths(
         self,
@@ -473,9 +465,3 @@ def scene_pairs(objects: Objects) -> tuple[Index, Index]:
     second = np.concatenate([t[1] + start for t, start in zip(triangles, starts, strict=True)])
     free = ~(objects.fixed[first] & objects.fixed[second])
     return first[free], second[free]
-
-
-def _near_pairs(objects: Objects, low: Array, high: Array) -> tuple[Index, Index]:
-    first, second = scene_pairs(objects)
-    near = _boxes_near(low, high, first, second, NEAR, objects.fixed[first] | objects.fixed[second])
-    return first[near], second[near]

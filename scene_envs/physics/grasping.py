@@ -235,15 +235,8 @@ def _frames(rotation: Array, back: Array) -> Array:
 
 def _concatenate(objects: Objects, category: int, rotation: Array, translation: Array) -> Objects:
     """The objects of one scene, followed by G tools."""
-    count = len(rotation)
-    return Objects(
-        np.concatenate([objects.scene, np.zeros(count, dtype=np.int64)]),
-        np.concatenate([objects.slot, np.full(count, -1)]),
-        np.concatenate([objects.category, np.full(count, category)]),
-        np.concatenate([objects.rotation, rotation.reshape(-1, 3, 3)]),
-        np.concatenate([objects.translation, translation.reshape(-1, 3)]),
-        np.concatenate([objects.fixed, np.zeros(count, dtype=bool)]),
-    )
+    scene = np.zeros(len(rotation), dtype=np.int64)
+    return objects + Objects(scene, scene - 1, scene + category, rotation, translation, scene > 0)
 
 
 def _tool(name: str, parts: tuple[ConvexPart, ...]) -> Asset:

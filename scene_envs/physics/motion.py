@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -50,19 +50,16 @@ class Physics:
         self.collider = Collider(library)
         self.support = Support(library)
         self.statics = Statics(library)
-        self._world: World | None = None
 
     def rest(self, objects: Objects, pairs: ObjectPairs, duration: float) -> Rest:
         """Objects of some scenes that need no simulation for ``duration`` seconds."""
         contacts = self.collider.contacts(objects, pairs, self.support.differs(objects, pairs))
         return self.statics.at_rest(objects, pairs, contacts, duration)
 
-    @property
+    @cached_property
     def world(self) -> World:
         """The PyBullet world, made on first use; MissingDependencyError without PyBullet."""
-        if self._world is None:
-            self._world = World(self.library)
-        return self._world
+        return World(self.library)
 
 
 _physics = cache(Physics)

@@ -18,7 +18,6 @@ from scene_envs.workers import Task, WorkerFailure, WorkerPool
 _LOGGER = logging.getLogger(__name__)
 _NO_MESH: Any = None
 """In place of an asset's mesh: workers draw nothing, so meshes are not sent to them."""
-_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 class KernelRunner:

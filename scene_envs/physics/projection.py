@@ -22,7 +22,7 @@ from scipy.sparse import csr_array
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import Collider, corner_tests, scene_pairs
 from scene_envs.physics.parts import LibraryGeometry, Rows
-from scene_envs.physics.placement import Budget, Objects, grouped_gaps, object_boxes, part_pairs, place
+from scene_envs.physics.placement import Budget, Level, Objects, grouped_gaps, object_boxes, part_pairs, place
 from scene_envs.physics.statics import components
 
 CLEARANCE = 2e-5
@@ -133,41 +133,25 @@ def separating_planes(
         home: (n, 3) wanted translations of the objects, m.
         budget: Work budget, charged with one unit per plane.
     """
-    coarse, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
-    budget.spend(len(coarse.pair))
-    nested = np.unique(coarse.pair[~apart])
+    coarse, pair, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
+    budget.spend(len(pair))
+    nested = np.unique(pair[~apart])
     if not len(nested):
-        return coarse.planes(np.ones(len(coarse.pair), dtype=bool))
-    kept = coarse.planes(~np.isin(coarse.pair, nested))
-    fine, apart = _planes_at("fine", collider, objects, first[nested], second[nested], extra[nested], home)
-    budget.spend(len(fine.pair))
-    return kept + fine.planes(np.ones(len(fine.pair), dtype=bool))
-
-
-@dataclass(frozen=True, eq=False)
-class _PartPlanes:
-    """One plane per near pair of parts; ``pair`` (Q,) is the index of the object pair."""
-
-    pair: Index
-    first: Index
-    second: Index
-    direction: Array
-    bound: Array
-
-    def planes(self, rows: Mask) -> Planes:
-        """As half-spaces for the objects."""
-        return Planes(self.first[rows], self.second[rows], self.direction[rows], self.bound[rows])
+        return coarse
+    fine, _, _ = _planes_at("fine", collider, objects, first[nested], second[nested], extra[nested], home)
+    budget.spend(len(fine.bound))
+    return coarse[~np.isin(pair, nested)] + fine
 
 
 def _planes_at(
-    level: str, collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array
-) -> tuple[_PartPlanes, Mask]:
-    placed = place(collider.library, objects, level)  # type: ignore[arg-type]
+    level: Level, collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array
+) -> tuple[Planes, Index, Mask]:
+    """A plane for each near pair of parts (Q,), its object pair (Q,), and whether the parts are apart (Q,)."""
+    placed = place(collider.library, objects, level)
     pair, a, b = part_pairs(placed, first, second)
     move = extra[pair]
-    near = ((placed.low[a] <= placed.high[b] + move + _REACH) & (placed.low[b] + move <= placed.high[a] + _REACH)).all(
-        axis=1
-    )
+    near = (placed.low[a] <= placed.high[b] + move + _REACH).all(axis=1)
+    near &= (placed.low[b] + move <= placed.high[a] + _REACH).all(axis=1)
     pair, a, b = pair[near], a[near], b[near]
     offset = objects.translation[second] - objects.translation[first] + extra
     away = (home[second] - home[first] - offset)[pair]
@@ -181,7 +165,7 @@ def _planes_at(
         line = np.arange(len(rows))
         direction[rows], best[rows] = normals[line, chosen], largest
         bound[rows] = np.einsum("qi,qi->q", direction[rows], offset[rows]) - gaps[line, chosen] + CLEARANCE
-    return _PartPlanes(pair, first[pair], second[pair], direction, bound), best >= -_APART
+    return Planes(first[pair], second[pair], direction, bound), pair, best >= -_APART
 
 
 def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget, cost: Array | None = None) -> Array:
@@ -197,8 +181,7 @@ def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget, cost:
         return nearest(objects, home * cost, scaled, budget) / cost
     result = home.copy()
     free = ~objects.fixed
-    mobile = lambda rows: (rows >= 0) & free[rows]  # noqa: E731
-    moves_first, moves_second = mobile(planes.first), mobile(planes.second)
+    moves_first, moves_second = ((rows >= 0) & free[rows] for rows in (planes.first, planes.second))
     both = moves_first & moves_second
     label = components(len(objects), planes.first[both], planes.second[both])
     owner = np.where(moves_second, label[planes.second], label[planes.first])
@@ -308,13 +291,14 @@ def minimum_translations(
     costs = lengths * _weights(collider, objects, first, second, directions, lengths, bounds)
     if cost is not None:
         costs *= np.linalg.norm(directions * cost, axis=-1)
+    best = np.empty(len(first), dtype=np.int64)
     for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-        for old in tried.get(key, ()):
+        before = tried.setdefault(key, [])
+        for old in before:
             costs[row, directions[row] @ old > _SAME_DIRECTION] *= _REPEATED
-    best = costs.argmin(axis=1)
+        best[row] = costs[row].argmin()
+        before.append(directions[row, best[row]])
     line = np.arange(len(first))
-    for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-        tried.setdefault(key, []).append(directions[row, best[row]])
     return directions[line, best] * (lengths[line, best] + CLEARANCE)[:, None]  # type: ignore[no-any-return]
 
 
@@ -435,13 +419,8 @@ def _weights(
     weight = np.ones(lengths.shape)
     fixed = objects.fixed[first] | objects.fixed[second]
     # The motion of the free object, or of the upper one of two.
-    upper = np.where(
-        objects.fixed[first],
-        second,
-        np.where(
-            objects.fixed[second] | (objects.translation[first, 2] > objects.translation[second, 2]), first, second
-        ),
-    )
+    first_above = objects.fixed[second] | (objects.translation[first, 2] > objects.translation[second, 2])
+    upper = np.where(~objects.fixed[first] & first_above, first, second)
     motion = np.where((upper == second)[:, None, None], directions, -directions)
     weight[fixed[:, None] & (motion[..., 2] < -0.7)] *= _DOWN
     weight[~fixed[:, None] & (np.abs(motion[..., 2]) > 0.7)] *= _UP
@@ -453,10 +432,9 @@ def _weights(
         low, high = object_boxes(place(collider.library, objects, "coarse"))
         boards = place(collider.library, objects[objects.fixed], "coarse")
         rise = np.where(motion[..., 2] > 0.7, lengths, 0.0)  # (P, D)
-        over = (boards.low[None, :, :2] < high[upper][:, None, :2]) & (
-            boards.high[None, :, :2] > low[upper][:, None, :2]
-        )
-        above = over.all(axis=2) & (boards.low[None, :, 2] > 0.5 * (low[upper] + high[upper])[:, None, 2])
+        above = (boards.low[None, :, :2] < high[upper][:, None, :2]).all(axis=2)
+        above &= (boards.high[None, :, :2] > low[upper][:, None, :2]).all(axis=2)
+        above &= boards.low[None, :, 2] > 0.5 * (low[upper] + high[upper])[:, None, 2]
         room = np.where(above, boards.low[None, :, 2] - high[upper][:, None, 2], np.inf).min(axis=1)
         weight[(rise > np.maximum(room, 0.0)[:, None]) & ~fixed[:, None]] *= _BLOCKED
     return weight
