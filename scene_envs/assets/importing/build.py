@@ -8,12 +8,10 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import Asset, ConvexPart, bounds_of, regular_plural
@@ -37,7 +35,7 @@ from scene_envs.assets.importing.solids import (
     thickness,
     visual_of,
 )
-from scene_envs.assets.shapes import MassProperties, join, mass_properties
+from scene_envs.assets.shapes import MassProperties, join, mass_properties, moved
 from scene_envs.errors import CorruptFileError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -258,22 +256,17 @@ def weigh(
     if density is not None:
         return Weight(mass_properties(parts, density * volume), (), ())
     if given is None or given.mass <= 0:
-        known = density_note = ""
+        known = "inertia computed from the shape"
         if mass is None:
-            known, density_note = "mass and inertia", f" at {DEFAULT_DENSITY:g} kg/m^3"
-            mass = DEFAULT_DENSITY * volume
-        else:
-            known = "inertia"
+            known, mass = f"mass and {known} at {DEFAULT_DENSITY:g} kg/m^3", DEFAULT_DENSITY * volume
         why = "the file gives none" if given is None else f"the file gives a mass of {given.mass:g} kg"
-        return Weight(mass_properties(parts, mass), (f"{known} computed from the shape{density_note}: {why}",), ())
+        return Weight(mass_properties(parts, mass), (f"{known}: {why}",), ())
     if mass is None:
-        low, high = _POSSIBLE
         found = given.mass / volume
-        if not low <= found <= high:
-            mass = DEFAULT_DENSITY * volume
+        if not _POSSIBLE[0] <= found <= _POSSIBLE[1]:
             reason = f"the file's {given.mass:g} kg would be {found:.3g} kg/m^3"
             text = f"mass and inertia recomputed at {DEFAULT_DENSITY:g} kg/m^3: {reason}"
-            return Weight(mass_properties(parts, mass), (), (text,))
+            return Weight(mass_properties(parts, DEFAULT_DENSITY * volume), (), (text,))
         mass = given.mass
     computed = mass_properties(parts, mass)
     inertia = given.inertia * (mass / given.mass)
@@ -398,8 +391,10 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
         warnings += weight.warnings
     visual = join(*(mesh for shape in model.visuals or shapes for mesh in visual_of(shape, entry.color)))
     shift = _shift(parts, entry, visual if static else None)
-    notes += _unlike(visual, parts, size)
-    fine = tuple(ConvexPart(_clean(part.vertices + shift), part.faces) for part in parts)
+    apart = float(np.abs(np.asarray(visual.bounds) - bounds_of(parts)).max())
+    if apart > max(_UNLIKE, 0.05 * size):
+        notes.append(f"the boxes of visual and collision geometry differ by up to {apart:.2g} m")
+    fine = tuple(_shifted(part, shift) for part in parts)
     if len(visual.faces) > _MANY_TRIANGLES:
         notes.append(f"{len(visual.faces)} triangles to draw; pictures will be slow")
     asset = Asset(
@@ -409,7 +404,7 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
         mass=properties.mass,
         center_of_mass=properties.center_of_mass + shift,
         inertia=properties.inertia,
-        visual=_moved(visual, shift),
+        visual=moved(visual, np.eye(3), shift),
         fine=fine,
         coarse=fine if len(fine) == 1 else (enclosing_hull(fine),),
         color=entry.color or (128, 128, 128),
@@ -512,14 +507,6 @@ def _collide(
     return parts, volume
 
 
-def _unlike(visual: trimesh.Trimesh, parts: Sequence[ConvexPart], size: float) -> list[str]:
-    """A note when visual and collision geometry have different bounding boxes."""
-    apart = float(np.abs(np.asarray(visual.bounds) - bounds_of(parts)).max())
-    if apart <= max(_UNLIKE, 0.05 * size):
-        return []
-    return [f"the boxes of visual and collision geometry differ by up to {apart:.2g} m"]
-
-
 def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trimesh | None) -> Array:
     """(3,) m: position of the file's origin in the asset frame; the box includes ``visual`` when it is given."""
     if entry.base == "origin":
@@ -530,29 +517,11 @@ def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trime
     return 0.0 - np.array([0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), low[2]])
 
 
-def _clean(vertices: Array) -> Array:
-    """The vertices, with heights that are 0 up to rounding set to exactly 0."""
+def _shifted(part: ConvexPart, shift: Array) -> ConvexPart:
+    """The part in the asset frame; heights that are 0 up to rounding become exactly 0."""
+    vertices = part.vertices + shift
     vertices[np.abs(vertices[:, 2]) < 1e-9, 2] = 0.0
-    return vertices
-
-
-def _moved(mesh: trimesh.Trimesh, shift: Array) -> trimesh.Trimesh:
-    import trimesh
-
-    return trimesh.Trimesh(
-        vertices=mesh.vertices + shift,
-        faces=mesh.faces,
-        vertex_normals=mesh.vertex_normals,
-        vertex_colors=mesh.visual.vertex_colors,  # type: ignore[union-attr]
-        process=False,
-    )
-
-
-@cache
-def _candidates() -> NDArray[np.float64]:
-    tones = [(s, v) for v in (0.85, 0.6, 0.4) for s in (0.85, 0.55)]
-    colors = [colorsys.hsv_to_rgb(hue / 36.0, s, v) for s, v in tones for hue in range(36)]
-    return np.rint(255.0 * np.array(colors))
+    return ConvexPart(vertices, part.faces)
 
 
 def distinct_colors(count: int, taken: Iterable[Color] = ()) -> list[Color]:
@@ -563,7 +532,8 @@ def distinct_colors(count: int, taken: Iterable[Color] = ()) -> list[Color]:
     >>> bool(gaps.min() > 60)
     True
     """
-    pool = _candidates()
+    tones = [(s, v) for v in (0.85, 0.6, 0.4) for s in (0.85, 0.55)]
+    pool = np.rint(255.0 * np.array([colorsys.hsv_to_rgb(hue / 36.0, s, v) for s, v in tones for hue in range(36)]))
     gaps = np.full(len(pool), np.inf)
     for color in ((255, 255, 255), *taken):
         gaps = np.minimum(gaps, np.linalg.norm(pool - np.asarray(color), axis=1))
