@@ -201,6 +201,17 @@ def fan(count: int) -> NDArray[np.int64]:
     return np.stack([np.zeros(count - 2, dtype=np.int64), np.arange(1, count - 1), np.arange(2, count)], axis=1)
 
 
+def sheet(outline: ArrayLike, color: Color) -> trimesh.Trimesh:
+    """A flat convex face (P, 3), counter-clockwise seen from its front: a lid, a label, a letter's stroke."""
+    points = np.asarray(outline, dtype=np.float64)
+    return surface(points, fan(len(points)), color)
+
+
+def walls(low: Array, high: Array) -> Array:
+    """(P, 4, 3): the quadrilaterals between neighbouring corners of two outlines (P, 3)."""
+    return np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1)
+
+
 def grid_faces(rows: int, around: int) -> NDArray[np.int64]:
     """(2 (rows - 1) around, 3): triangles between neighbouring rows of points, each row closed around."""
     grid = np.arange(rows * around).reshape(rows, around)

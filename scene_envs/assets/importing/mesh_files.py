@@ -1,4 +1,4 @@
-"""Reader of mesh files: checked triangles with a colour per corner."""
+"""Model files as data: shapes and inertials, meshes with a colour per corner, and checked numbers of XML files."""
 
 from __future__ import annotations
 
@@ -98,9 +98,8 @@ def from_roll_pitch_yaw(angles: Array) -> Array:
 def moved_inertial(pose: Array, inertial: Inertial) -> Inertial:
     """The inertial of a link in the frame that ``pose`` (4, 4) maps to."""
     turn = pose[:3, :3]
-    return Inertial(
-        inertial.mass, turn @ inertial.center_of_mass + pose[:3, 3], turn @ inertial.inertia @ turn.T
-    )  # fmt: skip
+    center = turn @ inertial.center_of_mass + pose[:3, 3]
+    return Inertial(inertial.mass, center, turn @ inertial.inertia @ turn.T)
 
 
 def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:

@@ -1,4 +1,4 @@
-"""SDF reader: the links of one model merged at zero joint positions."""
+"""Readers of SDF and URDF: the links of one model merged at zero joint positions."""
 
 from __future__ import annotations
 

@@ -169,14 +169,12 @@ def convex_parts(
             continue
         pieces = _decompose(body, method, threshold, what)
         if pieces is None:
-            warnings.append(
+            warnings = [
                 f"{what} is concave and is taken as its hull, because CoACD is not installed "
                 "(`pip install 'scene-envs[decomposition]'`)"
-            )
-            parts.append(hull)
-            continue
-        parts += [_hull(piece, tolerance) for piece in pieces]
-    return parts, notes, sorted(set(warnings))
+            ]
+        parts += [hull] if pieces is None else [_hull(piece, tolerance) for piece in pieces]
+    return parts, notes, warnings
 
 
 def _bodies(surface: trimesh.Trimesh, tolerance: float) -> tuple[list[trimesh.Trimesh], int]:
@@ -352,18 +350,15 @@ def meshes_of(shape: Shape) -> list[trimesh.Trimesh]:
     """
     assert shape.path is not None
     changed = shape.path.stat().st_mtime_ns if shape.path.is_file() else 0
-    return [_transformed(mesh, shape.pose, shape.size) for mesh in _file(shape.path, changed)]
-
-
-def _transformed(mesh: trimesh.Trimesh, pose: Array, scale: tuple[float, ...]) -> trimesh.Trimesh:
-    moved: Any = mesh.copy()
-    moved.vertices = (np.asarray(mesh.vertices) * scale) @ pose[:3, :3].T + pose[:3, 3]
-    if np.prod(scale) < 0:  # a mirror turns triangles inside out
-        colors = moved.visual.face_colors if moved.visual.kind == "face" else None
-        moved.faces = np.asarray(mesh.faces)[:, ::-1]
-        if colors is not None:
-            moved.visual.face_colors = colors
-    return moved  # type: ignore[no-any-return]
+    meshes: list[Any] = [mesh.copy() for mesh in _file(shape.path, changed)]
+    for mesh in meshes:
+        mesh.vertices = (np.asarray(mesh.vertices) * shape.size) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+        if np.prod(shape.size) < 0:  # a mirror turns triangles inside out
+            colors = mesh.visual.face_colors if mesh.visual.kind == "face" else None
+            mesh.faces = np.asarray(mesh.faces)[:, ::-1]
+            if colors is not None:
+                mesh.visual.face_colors = colors
+    return meshes
 
 
 def visual_of(shape: Shape, color: Color | None) -> list[trimesh.Trimesh]:
@@ -371,10 +366,6 @@ def visual_of(shape: Shape, color: Color | None) -> list[trimesh.Trimesh]:
     chosen = shape.color or color
     if shape.kind == "mesh":
         return [painted(mesh, chosen) for mesh in meshes_of(shape)]
-    return [painted(_smooth(shape), chosen)]
-
-
-def _smooth(shape: Shape) -> trimesh.Trimesh:
     from trimesh import creation
 
     size = shape.size
@@ -390,7 +381,7 @@ def _smooth(shape: Shape) -> trimesh.Trimesh:
         mesh = creation.icosphere(subdivisions=3)
         mesh.vertices = mesh.vertices * np.broadcast_to(size, 3)
     mesh.apply_transform(shape.pose)
-    return mesh  # type: ignore[no-any-return]
+    return [painted(mesh, chosen)]
 
 
 def collision_of(shape: Shape, method: Method, tolerance: float, threshold: float) -> Collision:
@@ -400,7 +391,8 @@ def collision_of(shape: Shape, method: Method, tolerance: float, threshold: floa
     circle. For meshes see :func:`convex_parts`.
     """
     if shape.kind != "mesh":
-        part = _placed(_primitive(shape), shape.pose)
+        part = _primitive(shape)
+        part = ConvexPart(part.vertices @ shape.pose[:3, :3].T + shape.pose[:3, 3], part.faces)
         return Collision([part], volume([part]), [], [])
     assert shape.path is not None
     result = Collision([], 0.0, [], [])
@@ -436,7 +428,3 @@ def _ball() -> Profile:
     """Half section of a unit ball with flat poles at z = -1 and 1."""
     angles = np.linspace(_CAP, np.pi - _CAP, 6)
     return [(float(np.sin(a)), float(-np.cos(a) / np.cos(_CAP))) for a in angles]
-
-
-def _placed(part: ConvexPart, pose: Array) -> ConvexPart:
-    return ConvexPart(part.vertices @ pose[:3, :3].T + pose[:3, 3], part.faces)

@@ -25,9 +25,11 @@ from scene_envs.assets.shapes import (
     quad_faces,
     ring,
     rods,
+    sheet,
     solid,
     surface,
     tube,
+    walls,
 )
 
 _SIDES = 12
@@ -274,10 +276,8 @@ def knife() -> Model:
 
 def _prism(low: Array, high: Array, color: Color) -> trimesh.Trimesh:
     """A sharp-edged skin between two outlines (K, 3), counter-clockwise from above, with its lid."""
-    count = len(low)
-    quads = np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1)
-    sides = surface(quads.reshape(-1, 3), quad_faces(count), color)
-    return join(sides, surface(high, fan(count), color), surface(low, fan(count)[:, ::-1], color))
+    sides = surface(walls(low, high).reshape(-1, 3), quad_faces(len(low)), color)
+    return join(sides, sheet(high, color), surface(low, fan(len(low))[:, ::-1], color))
 
 
 def _rounded(outline: Array, rounds: int = 2) -> Array:

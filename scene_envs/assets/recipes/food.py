@@ -1,4 +1,4 @@
-"""Apples, pears and avocados: solids of revolution that stand on a flat foot."""
+"""Food: apples, pears and avocados, which are solids of revolution on a flat foot, cereal and bread."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import trimesh
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import Model, asset_recipe
-from scene_envs.assets.recipes.painted import Cells, Paint, curve, loft, revolve, sheet
-from scene_envs.assets.shapes import Color, Profile, box, circle, convex_hull, hull_of, join, solid, tube
+from scene_envs.assets.recipes.painted import Cells, Paint, curve, loft, revolve
+from scene_envs.assets.shapes import Color, Profile, box, circle, convex_hull, hull_of, join, sheet, solid, tube
 
 _SIDES = 12
 _STEM: Color = (96, 66, 38)

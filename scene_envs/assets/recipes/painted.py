@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from scene_envs.arrays import Array
-from scene_envs.assets.shapes import Color, Profile, arc, circle, fan, join, quad_faces, surface
+from scene_envs.assets.shapes import Color, Profile, arc, circle, join, quad_faces, sheet, surface, walls
 
 Cells = NDArray[np.int64]
 """Indices into the colours of a surface, one per cell."""
@@ -88,22 +88,16 @@ def loft(loops: ArrayLike, colors: Sequence[Color]) -> trimesh.Trimesh:
         colors: K + 1 colours: the underside, K - 1 walls, the top.
     """
     outlines = np.asarray(loops, dtype=np.float64)
-    walls = []
+    skins = []
     for low, high, color in zip(outlines[:-1], outlines[1:], colors[1:-1], strict=True):
-        quads = np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1)
+        quads = walls(low, high)
         facing = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
         facing /= np.linalg.norm(facing, axis=1, keepdims=True)
         corner = facing + np.roll(facing, 1, axis=0)
         corner /= np.linalg.norm(corner, axis=1, keepdims=True)
         normals = np.stack([corner, np.roll(corner, -1, axis=0), np.roll(corner, -1, axis=0), corner], axis=1)
-        walls.append(surface(quads.reshape(-1, 3), quad_faces(len(quads)), color, normals.reshape(-1, 3)))
-    return join(sheet(outlines[0, ::-1], colors[0]), *walls, sheet(outlines[-1], colors[-1]))
-
-
-def sheet(outline: ArrayLike, color: Color) -> trimesh.Trimesh:
-    """A flat convex face (P, 3), counter-clockwise seen from its front: a lid, a label, a letter's stroke."""
-    points = np.asarray(outline, dtype=np.float64)
-    return surface(points, fan(len(points)), color)
+        skins.append(surface(quads.reshape(-1, 3), quad_faces(len(quads)), color, normals.reshape(-1, 3)))
+    return join(sheet(outlines[0, ::-1], colors[0]), *skins, sheet(outlines[-1], colors[-1]))
 
 
 def _normals(points: Array, section: Array) -> Array:

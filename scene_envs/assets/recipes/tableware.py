@@ -1,17 +1,16 @@
-"""Flat ware: a flat base with a rim that rises outward."""
+"""Plates, bowls, a can, a bottle, steamers, a teacup and a teapot."""
 
 from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import trimesh
 
 from scene_envs.arrays import Array
-from scene_envs.assets.base import ConvexPart, Model, asset_recipe
-from scene_envs.assets.recipes.painted import sheet, sleeve
+from scene_envs.assets.base import Model, asset_recipe
+from scene_envs.assets.recipes.painted import sleeve
 from scene_envs.assets.shapes import (
     Color,
     Profile,
@@ -24,6 +23,7 @@ from scene_envs.assets.shapes import (
     planks,
     ring,
     rods,
+    sheet,
     solid,
     tube,
 )
@@ -78,31 +78,19 @@ def serving_dish() -> Model:
 _SIDES = 12
 
 
-class _Bowl(NamedTuple):
-    """Lengths (m): outside and inside (r, z) at the joint of the bands, and sizes of floor and rim."""
-
-    foot: float
-    floor: float
-    outer: tuple[float, float]
-    inner: tuple[float, float]
-    radius: float
-    height: float
-    wall: float
-
-    def parts(self) -> list[ConvexPart]:
-        """The floor disc and the two bands of wedges."""
-        low = [(self.foot, 0.0), self.outer, self.inner, (self.foot, self.floor)]
-        high = [self.outer, (self.radius, self.height), (self.radius - self.wall, self.height), self.inner]
-        floor = solid([(self.foot, 0.0), (self.foot, self.floor)], _SIDES)
-        return [floor, *ring(low, _SIDES), *ring(high, _SIDES)]
-
-
-_CEREAL = _Bowl(0.036, 0.006, (0.0605, 0.027), (0.0555, 0.029), 0.0725, 0.065, 0.005)
-_FRUIT = _Bowl(0.052, 0.006, (0.091, 0.033), (0.086, 0.036), 0.110, 0.075, 0.005)
-
-
-def _model(bowl: _Bowl, profile: Profile, colors: list[Color]) -> Model:
-    parts = bowl.parts()
+def _bowl(
+    foot: float,
+    outer: tuple[float, float],
+    inner: tuple[float, float],
+    rim: tuple[float, float],
+    profile: Profile,
+    colors: list[Color],
+) -> Model:
+    """A bowl (m) of a floor disc and two bands of wedges that meet at ``outer`` and ``inner``, both (r, z)."""
+    low = [(foot, 0.0), outer, inner, (foot, 0.006)]
+    high = [outer, rim, (rim[0] - 0.005, rim[1]), inner]
+    floor = solid([(foot, 0.0), (foot, 0.006)], _SIDES)
+    parts = [floor, *ring(low, _SIDES), *ring(high, _SIDES)]
     return Model(lathe(profile, colors, segments=56), parts, parts)
 
 
@@ -111,8 +99,8 @@ def bowl() -> Model:
     """A cereal bowl; its floor is flat within 34 mm of the axis, 6 mm above the table."""
     blue: Color = (112, 150, 176)
     inside: Color = (240, 240, 234)
-    return _model(
-        _CEREAL,
+    return _bowl(
+        0.036, (0.0605, 0.027), (0.0555, 0.029), (0.0725, 0.065),
         [
             (0.0, 0.003), (0.029, 0.003), (0.031, 0.0), (0.035, 0.0), (0.036, 0.0025), (0.0455, 0.0095),
             (0.0540, 0.0175), (0.0605, 0.0270), (0.0655, 0.0390), (0.0692, 0.0510), (0.0722, 0.0632),
@@ -129,8 +117,8 @@ def fruit_bowl() -> Model:
     wood: Color = (168, 112, 64)
     dark: Color = (140, 88, 48)
     grain: Color = (184, 130, 80)
-    return _model(
-        _FRUIT,
+    return _bowl(
+        0.052, (0.091, 0.033), (0.086, 0.036), (0.110, 0.075),
         [
             (0.0, 0.003), (0.045, 0.003), (0.047, 0.0), (0.051, 0.0), (0.052, 0.0025), (0.0690, 0.0130),
             (0.0815, 0.0230), (0.0910, 0.0335), (0.0985, 0.0460), (0.1045, 0.0590), (0.1095, 0.0730), (0.1085, 0.0750),
