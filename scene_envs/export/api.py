@@ -213,9 +213,11 @@ def export(
         folder.mkdir(exist_ok=True)
         scenes.append({name: write(scene, files, folder) for name, write in writers.items()})
     manifest["formats"] = sorted({*manifest["formats"], *names})
-    _write_manifest(root, manifest)
+    write_json(root / MANIFEST, manifest)
     used = tuple(dict.fromkeys(asset.name for scene in placed for asset in scene.assets))
-    return ExportReport(root, names, tuple(scenes), used, _size(root))
+    folders = [root / "assets", *root.glob("scene_[0-9]*")]
+    size = sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
+    return ExportReport(root, names, tuple(scenes), used, size)
 
 
 def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
@@ -250,12 +252,8 @@ def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
         raise InvalidInputError(
             f"{str(root)!r} already holds {taken[0]!r}, which no export wrote; choose an empty folder as output"
         )
-    _write_manifest(root, fresh)
+    write_json(root / MANIFEST, fresh)
     return fresh
-
-
-def _write_manifest(root: Path, manifest: Mapping[str, Any]) -> None:
-    write_json(root / MANIFEST, manifest)
 
 
 def _digest(batch: SceneBatch) -> str:
@@ -269,8 +267,3 @@ def _digest(batch: SceneBatch) -> str:
         for part in asset.fine:
             digest.update(part.vertices.tobytes())
     return digest.hexdigest()[:16]
-
-
-def _size(root: Path) -> int:
-    folders = [root / "assets", *root.glob("scene_[0-9]*")]
-    return sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())

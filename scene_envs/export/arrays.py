@@ -1,4 +1,4 @@
-"""Plain arrays: ``.npz``, and a pickled dictionary for programs that read pickles."""
+"""Files of one scene without physics: ``.npz``, a pickled dictionary of the same arrays, and a coloured ``.glb``."""
 
 from __future__ import annotations
 

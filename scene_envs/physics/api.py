@@ -52,11 +52,8 @@ def run_kernel(
     workers = max(1, pool.workers) if pool else 1
     size = max(1, min(_CHUNK, -(-len(batch) // workers)))
     limits = None if units is None else units.double().cpu().numpy()
-    chunks = []
-    for start in range(0, len(batch), size):
-        rows = slice(start, start + size)
-        some = None if limits is None else limits[rows]
-        chunks.append(Chunk(batch.scene_type, translations[rows], rotations[rows], categories[rows], some))
+    whole = Chunk(batch.scene_type, translations, rotations, categories, limits)
+    chunks = [whole[start : start + size] for start in range(0, len(batch), size)]
     results = (pool or PhysicsPool(workers=0)).run(kernel, chunks, options)
     if lost := sum(row is not None and not row["valid"] for row in results):
         _LOGGER.debug(

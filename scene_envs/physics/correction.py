@@ -110,7 +110,9 @@ def corrections(batch: SceneBatch, spread: Array, movable: Mask | None = None) -
     workspace = batch.scene_type.workspace
     for start in range(0, len(batch), _CHUNK):
         some, free = batch[start : start + _CHUNK], movable[start : start + _CHUNK]
-        objects = _objects(physics, some, free)
+        poses = some.translations.double().numpy(), some.rotations.double().numpy()
+        fixed = some.is_welded.numpy() | ~free
+        objects = flatten(physics.library, *poses, some.categories.numpy(), fixed)
         if not len(objects):
             continue
         before, at = objects.translation, (objects.scene, objects.slot)
@@ -122,12 +124,6 @@ def corrections(batch: SceneBatch, spread: Array, movable: Mask | None = None) -
         moves[start + objects.scene, objects.slot] = objects.translation - before
         moves[start + objects.scene, objects.slot, 2] -= np.where(down > _FLOATING, down, 0.0)
     return torch.as_tensor(moves, dtype=batch.tensor.dtype)
-
-
-def _objects(physics: Physics, batch: SceneBatch, movable: Mask) -> Objects:
-    """The objects of scenes; welded ones, and those that may not move, are fixed."""
-    poses = batch.translations.double().numpy(), batch.rotations.double().numpy()
-    return flatten(physics.library, *poses, batch.categories.numpy(), batch.is_welded.numpy() | ~movable)
 
 
 def _apart(physics: Physics, objects: Objects, workspace: Corners, cost: Array) -> Array:

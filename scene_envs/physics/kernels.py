@@ -35,9 +35,7 @@ class Chunk:
     def __len__(self) -> int:
         return len(self.categories)
 
-    def row(self, index: int) -> Chunk:
-        """One scene as a chunk."""
-        rows = slice(index, index + 1)
+    def __getitem__(self, rows: slice) -> Chunk:
         units = None if self.units is None else self.units[rows]
         return Chunk(self.scene_type, self.translations[rows], self.rotations[rows], self.categories[rows], units)
 
@@ -151,7 +149,7 @@ def settle_kernel(chunk: Chunk, *, duration: float, iterations: int) -> dict[str
     finished, spent = np.ones(len(chunk), dtype=bool), np.zeros(len(chunk))
     bottom = chunk.scene_type.workspace[0][2] - _FALLEN
     for index in range(len(chunk)):
-        row = chunk.row(index)
+        row = chunk[index : index + 1]
         physics, objects, _ = _start(row)
         valid[index] = not _is_heap(physics, objects)
         if not valid[index]:
@@ -179,7 +177,7 @@ def projection_kernel(chunk: Chunk) -> dict[str, Any]:
     translations = chunk.translations.copy()
     residual, heap = np.zeros(len(chunk)), np.zeros(len(chunk), dtype=bool)
     for index in range(len(chunk)):
-        physics, objects, _ = _start(chunk.row(index))
+        physics, objects, _ = _start(chunk[index : index + 1])
         result = project_objects(physics.collider, objects, chunk.scene_type.workspace)
         translations[index, objects.slot] = result.translation
         residual[index], heap[index] = result.residual_depth, result.heap
@@ -196,7 +194,7 @@ def units_kernel(chunk: Chunk) -> dict[str, Any]:
     """Units of simulation that each scene may spend; 0 for heaps, which are not simulated."""
     units = np.zeros(len(chunk))
     for index in range(len(chunk)):
-        physics, objects, _ = _start(chunk.row(index))
+        physics, objects, _ = _start(chunk[index : index + 1])
         if not heaps(physics.collider, objects).any():
             units[index] = simulation_units(objects, physics.collider.pairs(objects))
     return {"units": units, "valid": np.ones(len(chunk), dtype=bool)}

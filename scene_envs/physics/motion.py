@@ -194,7 +194,7 @@ def _simulate(
         if budget.is_spent:
             return
         if settling is not None:
-            settings = SolverSettings(settings.time_step, settling, _DAMPING, _DAMPING)
+            settings = SolverSettings(settings.time_step, settling, _DAMPING)
         settings = replace(settings, tilt=tilt)
         rows = np.flatnonzero(objects.fixed | members)
         end = physics.world.simulate(objects[rows], fine[rows], group[rows], duration, settings, budget)

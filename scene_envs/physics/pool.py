@@ -100,7 +100,9 @@ class PhysicsPool(WorkerPool):
             (kernel, scene_type, arrays, options),
             f"physics of scenes {first} to {first + len(chunk) - 1}",
             once,
-            lambda: [self._task(kernel, chunk.row(index), options, first + index) for index in range(len(chunk))],
+            lambda: [
+                self._task(kernel, chunk[index : index + 1], options, first + index) for index in range(len(chunk))
+            ],
         )
 
 
