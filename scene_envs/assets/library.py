@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 
 from scene_envs.assets.base import Asset, AssetLibrary
-from scene_envs.assets.importing.user_library import find_asset, folder_index
+from scene_envs.assets.importing.user_library import folder_index
 from scene_envs.assets.recipes import RECIPES
 from scene_envs.assets.shapes import mass_properties
 from scene_envs.errors import InvalidInputError, UnknownNameError, unknown_name
@@ -57,8 +57,10 @@ def _find(name: str, own: Sequence[str], folders: Sequence[str | os.PathLike[str
         return _built_in(name)
     else:
         places = tuple(folder for folder in _known_folders if os.path.isdir(folder))
-    if (asset := find_asset(name, places)) is not None:
-        return asset
+    for index in map(folder_index, places):
+        for entry in index.entries:
+            if entry.name == name:
+                return index.build(entry)[0]
     known = [known for folder in places for known in folder_index(folder).names]
     error = unknown_name("asset", name, [*own, *known, *list_assets()])
     raise UnknownNameError(f"{error} Assets of your own: give the folder in folders=, or register their scene type.")

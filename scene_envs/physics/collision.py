@@ -340,7 +340,8 @@ class Collider:
             rough[overlapping] = tests[objects.scene[a]] > _TOO_MANY
             depth[rough] = -gap[rough]
             exact = overlapping[~rough[overlapping]]
-            self._fine_depths(objects, first, second, exact, gap, depth, total, part_count, totals)
+            found = self._fine_depths(objects, first[exact], second[exact], gap[exact], totals)
+            depth[exact], total[exact], part_count[exact] = found
         return ObjectPairs(first, second, gap, direction, depth, total, part_count, low, high, contacts, rough)
 
     def contacts(self, objects: Objects, pairs: ObjectPairs, fine: Mask) -> Contacts:
@@ -367,29 +368,21 @@ class Collider:
         return Contacts(first[pair], second[pair], part[a], part[b], gap, direction), pair
 
     def _fine_depths(
-        self,
-        objects: Objects,
-        first: Index,
-        second: Index,
-        overlapping: Index,
-        gap: Array,
-        depth: Array,
-        total: Array,
-        part_count: Index,
-        totals: bool,
-    ) -> None:
+        self, objects: Objects, first: Index, second: Index, gap: Array, totals: bool
+    ) -> tuple[Array, Array, Index]:
+        """Depth (P,) m of each object pair, sum of the depths of its part pairs (P,) m, and their number (P,)."""
+        depth, total, part_count = np.zeros(len(gap)), np.zeros(len(gap)), np.zeros(len(gap), dtype=np.int64)
         # The depth of objects that barely touch is the bound from the face planes of the enclosing coarse parts.
         # Sums over part pairs need the fine parts, unless each of the two objects has only one.
-        single = np.array([len(asset.fine.parts) == 1 for asset in self.library.assets])
         simple = gap > -TOUCHING
         if totals:
+            single = np.array([len(asset.fine.parts) == 1 for asset in self.library.assets])
             simple &= single[objects.category[first]] & single[objects.category[second]]
-        settled = overlapping[simple[overlapping]]
-        depth[settled] = total[settled] = -gap[settled]
-        part_count[settled] = 1
-        hard = overlapping[~simple[overlapping]]
+        depth[simple] = total[simple] = -gap[simple]
+        part_count[simple] = 1
+        hard = np.flatnonzero(~simple)
         if not len(hard):
-            return
+            return depth, total, part_count
         used, local = np.unique(np.concatenate([first[hard], second[hard]]), return_inverse=True)
         fine = place(self.library, objects[used], "fine")
         pair, a, b = part_pairs(fine, local[: len(hard)], local[len(hard) :])
@@ -410,6 +403,7 @@ class Collider:
             np.maximum.at(depth, target[rows[meet]], value[meet])
             np.add.at(total, target[rows[meet]], value[meet])
             np.add.at(part_count, target[rows[meet]], 1)
+        return depth, total, part_count
 
 
 def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, second: Index) -> Array:
@@ -419,13 +413,10 @@ def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, secon
 
 
 def _rounds(target: Index, bound: Array, depth: Array, every: bool) -> Iterator[Index]:
-    """Rows of candidates that can still deepen their object pair; twice as many per pair in each round.
+    """Rows of candidates that can still deepen their object pair; twice as many per pair in each round, or all at once.
 
-    Args:
-        target: (Q,) object pair of each candidate, those of one pair together.
-        bound: (Q,) m, upper bound of each candidate's depth; descending within a pair.
-        depth: (P,) m, depths found so far; the caller updates them between rounds.
-        every: Whether to give all candidates at once.
+    The candidates of an object pair ``target`` (Q,) stand together, and the upper bounds ``bound`` (Q,) m of their
+    depths descend. The caller updates ``depth`` (P,) m, the depths found so far, between rounds.
     """
     rows = np.arange(len(target))
     if every:

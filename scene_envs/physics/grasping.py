@@ -160,11 +160,9 @@ class _Hand:
         return np.setdiff1d(free, open_rows)
 
     def _extents(self, objects: Objects, rows: Index, back: Array) -> tuple[Index, Array, Array, Array]:
-        """Gripper frames for some objects, and the extents of the objects along the axes of these frames.
+        """Gripper frames for some objects: owner (G,), rotation (G, 3, 3) to the world, and the owner's extents in it.
 
-        Returns:
-            owner (G,), rotation (G, 3, 3) gripper to world, lowest and highest coordinate (G, 3), (G, 3) m along the
-            axes of the gripper.
+        The extents are the lowest and highest coordinates (G, 3), (G, 3) m along the axes of the gripper.
         """
         rotation = _frames(objects.rotation[rows], back)  # (n, T, 3, 3)
         low, high = np.empty(rotation.shape[:3]), np.empty(rotation.shape[:3])

@@ -92,18 +92,10 @@ def motion(
     budgets: Sequence[Budget],
     tilt: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Array, Array, Index]:
-    """Displacement of the objects of several scenes in ``duration`` seconds.
+    """Displacement (n,) m and rotation (n,) rad of the objects of several scenes in ``duration`` seconds.
 
-    Args:
-        physics: Physics of the scenes' assets.
-        objects: Objects of the scenes.
-        pairs: Near pairs of the objects.
-        duration: Simulated time, s.
-        budgets: Units of simulation that each scene may spend.
-        tilt: (x, y) angles by which gravity is tilted in simulations, rad.
-
-    Returns:
-        displacement (n,) m, rotation (n,) rad, and the scenes whose simulation diverged or was too much work.
+    Also returns the scenes whose simulation diverged or was too much work: ``budgets`` hold the units that each may
+    spend. ``tilt`` is the (x, y) angles (rad) by which gravity is tilted in simulations.
     """
     rest = physics.rest(objects, pairs, duration)
     displacement, rotation = np.abs(rest.rise), rest.tilt.copy()
@@ -138,16 +130,9 @@ def advance(
     simulated object reaches an object that was not simulated, or that had come to rest and left the simulation, the two
     are simulated again together.
 
-    Args:
-        physics: Physics of the scene's assets.
-        objects: Objects of one scene.
-        pairs: Near pairs of the objects.
-        rest: Objects with a closed form, and their motion.
-        duration: Simulated time, s.
-        budget: Units of simulation; when they are spent, objects stay at the poses reached.
-        settling: Solver iterations per step of a damped motion. None simulates undamped, and doubtful motion again with
-            other settings.
-        tilt: (x, y) angles by which gravity is tilted in simulations, rad.
+    When ``budget`` is spent, objects stay at the poses reached. ``settling`` is the number of solver iterations per
+    step of a damped motion; None simulates undamped, and doubtful motion again with other settings. ``tilt`` is the
+    (x, y) angles (rad) by which gravity is tilted in simulations.
     """
     translation = objects.translation.copy()
     translation[:, 2] += rest.rise
@@ -272,14 +257,8 @@ def settle_scene(
 ) -> tuple[Array, Array, bool]:
     """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether they stayed finite.
 
-    Args:
-        physics: Physics of the scene's assets.
-        objects: Objects of one scene.
-        pairs: Near pairs of the objects.
-        duration: Longest time to simulate, s.
-        iterations: Solver iterations per step.
-        bottom: Height (m) below which objects are simulated no further.
-        budget: Units of simulation; when they are spent, objects stay at the poses reached.
+    The motion lasts at most ``duration`` seconds. Objects below the height ``bottom`` (m) are simulated no further, and
+    when ``budget`` is spent, all stay at the poses reached.
     """
     current = objects
     calm = np.zeros(len(objects), dtype=bool)  # was simulated, and did not move

@@ -100,9 +100,7 @@ class PhysicsPool(WorkerPool):
             (kernel, scene_type, arrays, options),
             f"physics of scenes {first} to {first + len(chunk) - 1}",
             once,
-            lambda: [
-                self._task(kernel, chunk[index : index + 1], options, first + index) for index in range(len(chunk))
-            ],
+            lambda: [self._task(kernel, chunk[row : row + 1], options, first + row) for row in range(len(chunk))],
         )
 
 

@@ -109,7 +109,7 @@ class Planes(Rows):
     bound: Array  # (Q,) m
 
 
-def near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
+def _near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
     """Object pairs of one scene whose boxes are within reach of each other: (P,), (P,)."""
     low, high = object_boxes(place(collider.library, objects, "coarse"))
     first, second = scene_pairs(objects)
@@ -117,21 +117,14 @@ def near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
     return first[near], second[near]
 
 
-def separating_planes(
+def _separating_planes(
     collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array, budget: Budget
 ) -> Planes:
-    """Planes that keep object pairs apart.
+    """Planes that keep object pairs (P,) of one scene apart; ``budget`` is charged with one unit per plane.
 
     Every pair of parts gets a face plane that separates the two parts now. Among several such planes the one with the
-    least move away from home is taken. Coarse parts are used where they are already apart, fine ones elsewhere.
-
-    Args:
-        collider: Geometry and exact distances.
-        objects: Objects of one scene, at their current translations.
-        first, second: (P,) object rows.
-        extra: (P, 3) vector added to the offset of each pair, m: the minimum translation, for pairs that overlap.
-        home: (n, 3) wanted translations of the objects, m.
-        budget: Work budget, charged with one unit per plane.
+    least move away from ``home`` (n, 3) m is taken. Coarse parts are used where they are already apart, fine ones
+    elsewhere. ``extra`` (P, 3) m is added to the offset of each pair: the minimum translation of those that overlap.
     """
     coarse, pair, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
     budget.spend(len(pair))
@@ -257,7 +250,7 @@ def _approximate(matrix: Array, needed: Array) -> Array:
     return transposed @ multipliers  # type: ignore[no-any-return]
 
 
-def minimum_translations(
+def _minimum_translations(
     collider: Collider,
     objects: Objects,
     first: Index,
@@ -269,14 +262,8 @@ def minimum_translations(
 ) -> Array:
     """(P, 3) m: translations that free overlapping object pairs when they are added to the offsets of the pairs.
 
-    Args:
-        collider: Geometry of the assets.
-        objects: Objects of one scene.
-        first, second: (P,) object rows.
-        bounds: Lowest and highest translations (n, 3), (n, 3) m.
-        tried: Directions that did not help; the directions of the returned translations are added to them.
-        budget: Work budget, charged with one unit per pair of parts.
-        cost: (3,) cost of a metre along each axis of the world; None for 1.
+    Directions that were ``tried`` and did not help cost more; the directions of the result are added to them. ``cost``
+    (3,) is that of a metre along each axis of the world. ``budget`` is charged with one unit per pair of parts.
     """
     placed = place(collider.library, objects, "fine")
     pair, a, b = part_pairs(placed, first, second)
@@ -466,17 +453,12 @@ def heaps(collider: Collider, objects: Objects) -> Mask:
     return chosen
 
 
-def spread(
+def _spread(
     library: LibraryGeometry, objects: Objects, chosen: Mask, wanted: Array, bounds: tuple[Array, Array]
 ) -> Array:
-    """Translations (n, 3) m at which the boxes of the chosen objects meet no other box, as far as there is room.
+    """Translations (n, 3) m, near the ``wanted`` ones (n, 3), at which the boxes of the chosen objects meet no other.
 
-    Args:
-        library: Geometry of the assets.
-        objects: Objects of one scene; those not chosen stay.
-        chosen: (n,) free objects to place anew.
-        wanted: (n, 3) wanted translations of the chosen objects, m.
-        bounds: Lowest and highest translations (n, 3), (n, 3) m.
+    Where there is no room, they meet as few others as possible. Objects that are not chosen stay.
     """
     coarse = place(library, objects, "coarse")
     low, high = object_boxes(coarse)
@@ -554,20 +536,14 @@ class Projection:
 
 
 def project_objects(collider: Collider, objects: Objects, workspace: Corners) -> Projection:
-    """Project the objects of one scene.
-
-    Args:
-        collider: Geometry of the assets, and the measure of overlap.
-        objects: Objects of one scene; fixed ones do not move.
-        workspace: Lowest and highest corner (m) for the translations of objects in it or close to it.
-    """
+    """Project the free objects of one scene; those in the ``workspace`` (m) or close to it end inside it."""
     home = objects.translation
     bounds = _bounds(home, objects, workspace)
     chosen, start, best = heaps(collider, objects), objects, None
     wanted, heap = home, bool(chosen.any())
     for _ in range(SEARCHES):
         if chosen.any():
-            wanted = np.where(chosen[:, None], spread(collider.library, start, chosen, home, bounds), wanted)
+            wanted = np.where(chosen[:, None], _spread(collider.library, start, chosen, home, bounds), wanted)
         found = replace(_search(collider, replace(objects, translation=wanted), bounds), heap=heap)
         if best is None or found.total_depth < best.total_depth:
             best = found
@@ -594,7 +570,7 @@ def separated(
     """
     if not len(first) or corner_tests(collider.library, objects, first, second).sum() > _OVERLAPPING:
         return objects.translation
-    near_first, near_second = near_pairs(collider, objects)
+    near_first, near_second = _near_pairs(collider, objects)
     overlapping = np.concatenate([first, second])
     kept = np.isin(near_first, overlapping) | np.isin(near_second, overlapping)
     # Fixed objects are always among them: boards above limit how far an object can be lifted.
@@ -636,7 +612,7 @@ def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -
             break  # a refinement led to another overlap: the last result without overlap is kept
         if budget.is_spent or corner_tests(collider.library, current, first, second).sum() > _OVERLAPPING:
             break
-        near = near_pairs(collider, current)
+        near = _near_pairs(collider, current)
         translation = _round(collider, current, home, first, second, near, bounds, walls, tried, budget)
         current = replace(current, translation=translation)
     assert best is not None
@@ -662,10 +638,10 @@ def _round(
     extra = np.zeros((len(near_first), 3))
     if len(first):
         count = len(current)
-        moves = minimum_translations(collider, current, first, second, bounds, tried, budget, cost)
+        moves = _minimum_translations(collider, current, first, second, bounds, tried, budget, cost)
         place_of = np.searchsorted(near_first * count + near_second, first * count + second)
         extra[place_of] = moves
-    planes = separating_planes(collider, current, near_first, near_second, extra, home, budget)
+    planes = _separating_planes(collider, current, near_first, near_second, extra, home, budget)
     return nearest(current, home, planes + walls, budget, cost)
 
 

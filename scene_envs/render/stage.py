@@ -179,10 +179,8 @@ class Stage:
         )
 
 
-@cache
-def get_stage(names: tuple[str, ...], folders: tuple[str, ...] = ()) -> Stage:
-    """The stage of this process for the assets ``names``, which are looked up in ``folders`` first."""
-    return Stage(names, folders)
+get_stage = cache(Stage)
+"""The stage of this process for asset names in category order, which are looked up in the given folders first."""
 
 
 def make_palette(codes: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], int]:

@@ -1,4 +1,4 @@
-"""Import of one file as an asset: reading, scaling, decomposition, mass, base."""
+"""Import of one file as an asset: its entry in ``library.yaml``, the body it becomes, and the report."""
 
 from __future__ import annotations
 
@@ -72,27 +72,14 @@ _SMALL, _LARGE = 2e-3, 20.0
 
 
 @dataclass(frozen=True)
-class AssetNames:
-    """File and names of an asset.
+class AssetEntry:
+    """One asset of a library: its file, its names and how its file becomes a body.
 
     Attributes:
         file: Path relative to the folder.
         name: Identifier; the stem of the file by default.
         display_name: Name in prompts; the identifier with spaces by default.
         plural: Plural of the display name; the regular one by default.
-    """
-
-    file: str
-    name: str = ""
-    display_name: str = ""
-    plural: str = ""
-
-
-@dataclass(frozen=True)
-class AssetEntry(AssetNames):
-    """One asset of a library: its names and how its file becomes a body.
-
-    Attributes:
         scale: Factor on all lengths; a file in millimetres needs 0.001.
         density: Density (kg/m^3) of the evenly filled shape.
         mass: Mass, kg.
@@ -104,6 +91,10 @@ class AssetEntry(AssetNames):
         concavity: CoACD's threshold, 0.01 (many parts) to 1 (one).
     """
 
+    file: str
+    name: str = ""
+    display_name: str = ""
+    plural: str = ""
     scale: float = 1.0
     density: float | None = None
     mass: float | None = None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -118,16 +117,6 @@ def folder_index(folder: str | os.PathLike[str]) -> FolderIndex:
         if (root / name).is_file():
             return _listed(root / name, _stamp(root / name))
     return _unlisted(root, _stamp(root))
-
-
-def find_asset(name: str, folders: Sequence[str | os.PathLike[str]]) -> Asset | None:
-    """The asset called ``name`` from the first folder that has it, or None."""
-    for folder in folders:
-        index = folder_index(folder)
-        for entry in index.entries:
-            if entry.name == name:
-                return index.build(entry)[0]
-    return None
 
 
 def _stamp(path: Path) -> tuple[int, int]:

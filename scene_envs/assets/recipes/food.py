@@ -51,11 +51,7 @@ def _cheek(spread: float) -> Paint:
 
 def _ripening(height: float) -> Paint:
     """Paint from the colour at the blossom end (0) to the colour at the stem (4)."""
-
-    def paint(angle: Array, z: Array) -> Cells:
-        return np.clip(np.floor(5.0 * (z / height) + 0.0 * angle), 0, 4).astype(np.int64)
-
-    return paint
+    return lambda angle, z: np.clip(np.floor(5.0 * (z / height) + 0.0 * angle), 0, 4).astype(np.int64)
 
 
 def _pebbled(height: float) -> Paint:
