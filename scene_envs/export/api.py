@@ -111,15 +111,6 @@ def list_formats() -> list[str]:
     return _FORMATS.names()
 
 
-def get_format(name: str) -> ExportFormat:
-    """The format called ``name``.
-
-    Raises:
-        UnknownNameError: no such format; the nearest known one is offered.
-    """
-    return _FORMATS[name]
-
-
 def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     """Names of formats, each once, from one name, several, or ``"all"`` (those registered that can be written here).
 
@@ -133,7 +124,7 @@ def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     """
     names = check_formats(formats)
     for name in names:
-        get_format(name).writer()
+        _FORMATS[name].writer()
     return names
 
 
@@ -147,7 +138,7 @@ def check_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     if not names:
         raise InvalidInputError(f"formats is empty; give at least one of {', '.join(list_formats())}")
     for name in names:
-        get_format(name).check()
+        _FORMATS[name].check()
     return names
 
 
@@ -200,7 +191,7 @@ def export(
     if not 0.0 <= friction < float("inf"):
         raise InvalidInputError(f"friction must be a finite number >= 0, got {friction}")
     names = resolve_formats(formats)
-    writers = {name: get_format(name).writer() for name in names}
+    writers = {name: _FORMATS[name].writer() for name in names}
     placed = place(batch)
     root = Path(output)
     manifest = _claim(root, batch, friction)

@@ -27,20 +27,11 @@ Rows = list[dict[str, Any] | None]
 
 
 def run_kernel(
-    kernel: str,
-    batch: SceneBatch,
-    options: dict[str, Any],
-    pool: PhysicsPool | None,
-    units: Tensor | None = None,
+    kernel: str, batch: SceneBatch, options: dict[str, Any], pool: PhysicsPool | None, units: Tensor | None = None
 ) -> Rows:
-    """Run a kernel on a batch: the results of each scene, None where it failed twice.
+    """Run a kernel of :data:`~scene_envs.physics.kernels.KERNELS`: results of each scene, None where it failed twice.
 
-    Args:
-        kernel: Name of a function of :data:`scene_envs.physics.kernels.KERNELS`.
-        batch: B scenes.
-        options: Keyword arguments of the kernel.
-        pool: Worker processes; None computes in this process.
-        units: (B,) float64, units that the simulation of each scene may spend; None derives them from its objects.
+    ``units`` (B,) float64 are those that the simulation of each scene may spend; None derives them from its objects.
 
     Raises:
         InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.

@@ -246,15 +246,10 @@ class World:
     def simulate(
         self, objects: Objects, fine: Mask, group: Index, duration: float, settings: SolverSettings, budget: Budget
     ) -> tuple[Array, Array, Array, Mask]:
-        """Move the objects of one scene for ``duration`` seconds under gravity.
+        """Move the objects (n,) of one scene for ``duration`` seconds under gravity.
 
-        Args:
-            objects: The n objects.
-            fine: (n,) bool; True for objects that collide with their fine parts.
-            group: (n,) number of the cluster of each free object; a cluster leaves the simulation when it is at rest.
-            duration: Simulated time, s.
-            settings: Settings of the integration.
-            budget: Units of simulation; when they are spent, all objects stay at the poses reached.
+        Objects that are ``fine`` (n,) collide with their fine parts. A cluster of free objects, those of one number in
+        ``group`` (n,), leaves the simulation when it is at rest. When ``budget`` is spent, all stay where they are.
 
         Returns:
             rotation (n, 3, 3) and translation (n, 3) m afterwards, the angle turned (n,) in radians, and the objects

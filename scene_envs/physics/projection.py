@@ -100,6 +100,17 @@ _OUTSIDE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
+class Projection:
+    """Translations of one scene's objects after projection."""
+
+    translation: Array  # (n, 3) m
+    residual_depth: float  # deepest overlap that is left, m
+    total_depth: float  # sum of the overlaps of object pairs that are left, m
+    overlapping: Mask  # (n,) bool, objects that still overlap another one
+    heap: bool = False  # whether the objects were a heap, which was spread before the first round
+
+
+@dataclass(frozen=True, eq=False)
 class Planes(Rows):
     """Half-spaces: ``direction . (x_second - x_first) >= bound``; object -1 is the world's origin."""
 
@@ -107,6 +118,171 @@ class Planes(Rows):
     second: Index  # (Q,) object rows
     direction: Array  # (Q, 3) unit
     bound: Array  # (Q,) m
+
+
+def project_objects(collider: Collider, objects: Objects, workspace: Corners) -> Projection:
+    """Project the free objects of one scene; those in the ``workspace`` (m) or close to it end inside it."""
+    home = objects.translation
+    bounds = _bounds(home, objects, workspace)
+    chosen, start, best = heaps(collider, objects), objects, None
+    wanted, heap = home, bool(chosen.any())
+    for _ in range(SEARCHES):
+        if chosen.any():
+            wanted = np.where(chosen[:, None], _spread(collider.library, start, chosen, home, bounds), wanted)
+        found = replace(_search(collider, replace(objects, translation=wanted), bounds), heap=heap)
+        if best is None or found.total_depth < best.total_depth:
+            best = found
+        if found.residual_depth <= TOLERANCE:
+            return found
+        chosen, start = found.overlapping & ~objects.fixed, replace(objects, translation=found.translation)
+    assert best is not None
+    return best
+
+
+def separated(
+    collider: Collider, objects: Objects, first: Index, second: Index, workspace: Corners, cost: Array
+) -> Array:
+    """Translations (n, 3) m of one scene after one round of projection of overlapping pairs (P,) and their neighbours.
+
+    A heap of objects, which would take too much work, is not changed. ``cost`` (3,) is that of a metre along each axis
+    of the world; the cheapest way out of an overlap is taken. Translations stay in the ``workspace`` (m).
+    """
+    if not len(first) or corner_tests(collider.library, objects, first, second).sum() > _OVERLAPPING:
+        return objects.translation
+    near_first, near_second = _near_pairs(collider, objects)
+    overlapping = np.concatenate([first, second])
+    kept = np.isin(near_first, overlapping) | np.isin(near_second, overlapping)
+    # Fixed objects are always among them: boards above limit how far an object can be lifted.
+    rows = np.unique(np.concatenate([near_first[kept], near_second[kept], np.flatnonzero(objects.fixed)]))
+    some = objects[rows]
+    one, other = np.searchsorted(rows, first), np.searchsorted(rows, second)
+    near = np.searchsorted(rows, near_first[kept]), np.searchsorted(rows, near_second[kept])
+    bounds = _bounds(some.translation, some, workspace)
+    home, walls, budget = some.translation, _walls(bounds), Budget(WORK)
+    result = objects.translation.copy()
+    result[rows] = _round(collider, some, home, one, other, near, bounds, walls, {}, budget, cost)
+    return result
+
+
+def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -> Projection:
+    """The nearest translations without overlap that a bounded number of rounds finds."""
+    home, walls, budget = objects.translation, _walls(bounds), Budget(WORK)
+    best, best_way = None, np.inf
+    waited = refinements = 0
+    tried: Tried = {}
+    current = replace(objects, translation=nearest(objects, home, walls, budget))
+    for _ in range(_ROUNDS):
+        first, second, measured = _measure(collider, current, budget)
+        way = float(((current.translation - home) ** 2).sum())
+        is_free = measured.residual_depth <= 0.5 * TOLERANCE
+        gain = best_way - way
+        waited += 1
+        if best is None or (measured.total_depth < best.total_depth and not is_free and best_way == np.inf):
+            best, waited = measured, 0
+        if is_free and way < best_way:
+            best, best_way = measured, way
+        if is_free:
+            refinements += 1
+            if refinements > _REFINEMENTS or way < _NEGLIGIBLE or gain < _GAIN * way:
+                break
+        elif waited > _PATIENCE:
+            break
+        elif best_way < np.inf:
+            break  # a refinement led to another overlap: the last result without overlap is kept
+        if budget.is_spent or corner_tests(collider.library, current, first, second).sum() > _OVERLAPPING:
+            break
+        near = _near_pairs(collider, current)
+        translation = _round(collider, current, home, first, second, near, bounds, walls, tried, budget)
+        current = replace(current, translation=translation)
+    assert best is not None
+    inside = _inside(best.translation, bounds)
+    return best if inside is best.translation else _measure(collider, replace(objects, translation=inside), budget)[2]
+
+
+def _round(
+    collider: Collider,
+    current: Objects,
+    home: Array,
+    first: Index,
+    second: Index,
+    near: tuple[Index, Index],
+    bounds: tuple[Array, Array],
+    walls: Planes,
+    tried: Tried,
+    budget: Budget,
+    cost: Array | None = None,
+) -> Array:
+    """The next translations: they free overlapping pairs (``first``, ``second``) and keep other ``near`` ones apart."""
+    near_first, near_second = near
+    extra = np.zeros((len(near_first), 3))
+    if len(first):
+        count = len(current)
+        moves = _minimum_translations(collider, current, first, second, bounds, tried, budget, cost)
+        place_of = np.searchsorted(near_first * count + near_second, first * count + second)
+        extra[place_of] = moves
+    planes = _separating_planes(collider, current, near_first, near_second, extra, home, budget)
+    return nearest(current, home, planes + walls, budget, cost)
+
+
+def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:
+    """Object pairs whose fine parts overlap deeper than half the tolerance, and the overlap of the whole scene."""
+    pairs = collider.pairs(objects)
+    budget.spend(len(pairs.contacts.gap))
+    deep = pairs.depth > 0.5 * TOLERANCE
+    first, second = pairs.first[deep], pairs.second[deep]
+    overlapping = np.isin(np.arange(len(objects)), np.concatenate([first, second]))
+    residual, total = float(pairs.depth.max(initial=0.0)), float(pairs.depth.sum())
+    return first, second, Projection(objects.translation, residual, total, overlapping)
+
+
+def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, Array]:
+    """Lowest and highest translations (n, 3); infinite for fixed objects and for objects far outside."""
+    low, high = np.array(workspace[0]), np.array(workspace[1])
+    loose = objects.fixed | ((home < low - _OUTSIDE) | (home > high + _OUTSIDE)).any(axis=1)
+    return np.where(loose[:, None], -np.inf, low + _INSIDE), np.where(loose[:, None], np.inf, high - _INSIDE)
+
+
+def _inside(translation: Array, bounds: tuple[Array, Array]) -> Array:
+    """The translations; if slack let some leave the workspace, they are put back."""
+    clipped = np.clip(translation, *bounds)
+    return clipped if (np.abs(clipped - translation) > 0.9 * _INSIDE).any() else translation
+
+
+def _walls(bounds: tuple[Array, Array]) -> Planes:
+    """The bounds as half-spaces."""
+    low, high = (np.nonzero(np.isfinite(limit)) for limit in bounds)
+    row, axis = np.concatenate([low[0], high[0]]), np.concatenate([low[1], high[1]])
+    sign = np.repeat([1.0, -1.0], [len(low[0]), len(high[0])])
+    limits = np.concatenate([bounds[0][low], -bounds[1][high]])
+    direction = np.zeros((len(row), 3))
+    direction[np.arange(len(row)), axis] = sign
+    return Planes(np.full(len(row), -1, dtype=np.int64), row, direction, limits)
+
+
+def heaps(collider: Collider, objects: Objects) -> Mask:
+    """(n,) free objects of one scene in groups that overlap so much that exact tests would take too long.
+
+    Objects nested as intended meet as many others but hardly overlap, so they are no heap.
+    """
+    low, high = object_boxes(place(collider.library, objects, "coarse"))
+    first, second = scene_pairs(objects)
+    meet = ((low[first] < high[second]) & (low[second] < high[first])).all(axis=1)
+    first, second = first[meet], second[meet]
+    free = ~objects.fixed
+    both = free[first] & free[second]
+    group = components(len(objects), first[both], second[both])
+    owner = group[np.where(free[first], first, second)]
+    tests = np.bincount(owner, weights=corner_tests(collider.library, objects, first, second), minlength=len(objects))
+    chosen = np.zeros(len(objects), dtype=bool)
+    for number in np.flatnonzero(tests > _HEAP):
+        a, b = first[owner == number], second[owner == number]
+        common = np.prod(np.minimum(high[a], high[b]) - np.maximum(low[a], low[b]), axis=1)
+        smaller = np.minimum(np.prod(high[a] - low[a], axis=1), np.prod(high[b] - low[b], axis=1))
+        most = np.argsort(-common / np.maximum(smaller, 1e-12), kind="stable")[:_LOOKED_AT]
+        looked_at = objects[np.unique(np.concatenate([a[most], b[most]]))]
+        if collider.pairs(looked_at).depth.max(initial=0.0) > _DEEP:
+            chosen |= free & (group == number)
+    return chosen
 
 
 def _near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
@@ -427,32 +603,6 @@ def _weights(
     return weight
 
 
-def heaps(collider: Collider, objects: Objects) -> Mask:
-    """(n,) free objects of one scene in groups that overlap so much that exact tests would take too long.
-
-    Objects nested as intended meet as many others but hardly overlap, so they are no heap.
-    """
-    low, high = object_boxes(place(collider.library, objects, "coarse"))
-    first, second = scene_pairs(objects)
-    meet = ((low[first] < high[second]) & (low[second] < high[first])).all(axis=1)
-    first, second = first[meet], second[meet]
-    free = ~objects.fixed
-    both = free[first] & free[second]
-    group = components(len(objects), first[both], second[both])
-    owner = group[np.where(free[first], first, second)]
-    tests = np.bincount(owner, weights=corner_tests(collider.library, objects, first, second), minlength=len(objects))
-    chosen = np.zeros(len(objects), dtype=bool)
-    for number in np.flatnonzero(tests > _HEAP):
-        a, b = first[owner == number], second[owner == number]
-        common = np.prod(np.minimum(high[a], high[b]) - np.maximum(low[a], low[b]), axis=1)
-        smaller = np.minimum(np.prod(high[a] - low[a], axis=1), np.prod(high[b] - low[b], axis=1))
-        most = np.argsort(-common / np.maximum(smaller, 1e-12), kind="stable")[:_LOOKED_AT]
-        looked_at = objects[np.unique(np.concatenate([a[most], b[most]]))]
-        if collider.pairs(looked_at).depth.max(initial=0.0) > _DEEP:
-            chosen |= free & (group == number)
-    return chosen
-
-
 def _spread(
     library: LibraryGeometry, objects: Objects, chosen: Mask, wanted: Array, bounds: tuple[Array, Array]
 ) -> Array:
@@ -522,159 +672,3 @@ def _lines(faces: Array, wanted: float, start: float, end: float) -> Array:
     highest = np.searchsorted(bins, np.arange(_BINS), "right") - 1
     used = highest >= lowest
     return np.unique(np.concatenate([[wanted, start, end], inside[lowest[used]], inside[highest[used]]]))
-
-
-@dataclass(frozen=True, eq=False)
-class Projection:
-    """Translations of one scene's objects after projection."""
-
-    translation: Array  # (n, 3) m
-    residual_depth: float  # deepest overlap that is left, m
-    total_depth: float  # sum of the overlaps of object pairs that are left, m
-    overlapping: Mask  # (n,) bool, objects that still overlap another one
-    heap: bool = False  # whether the objects were a heap, which was spread before the first round
-
-
-def project_objects(collider: Collider, objects: Objects, workspace: Corners) -> Projection:
-    """Project the free objects of one scene; those in the ``workspace`` (m) or close to it end inside it."""
-    home = objects.translation
-    bounds = _bounds(home, objects, workspace)
-    chosen, start, best = heaps(collider, objects), objects, None
-    wanted, heap = home, bool(chosen.any())
-    for _ in range(SEARCHES):
-        if chosen.any():
-            wanted = np.where(chosen[:, None], _spread(collider.library, start, chosen, home, bounds), wanted)
-        found = replace(_search(collider, replace(objects, translation=wanted), bounds), heap=heap)
-        if best is None or found.total_depth < best.total_depth:
-            best = found
-        if found.residual_depth <= TOLERANCE:
-            return found
-        chosen, start = found.overlapping & ~objects.fixed, replace(objects, translation=found.translation)
-    assert best is not None
-    return best
-
-
-def separated(
-    collider: Collider, objects: Objects, first: Index, second: Index, workspace: Corners, cost: Array
-) -> Array:
-    """Translations (n, 3) after one round of projection of overlapping objects and their neighbours.
-
-    A heap of objects, which would take too much work, is not changed.
-
-    Args:
-        collider: Geometry of the assets.
-        objects: Objects of one scene; fixed ones do not move.
-        first, second: (P,) object rows of the pairs that overlap.
-        workspace: Lowest and highest corner (m) for the translations.
-        cost: (3,) cost of a metre along each axis of the world; the cheapest way out of an overlap is taken.
-    """
-    if not len(first) or corner_tests(collider.library, objects, first, second).sum() > _OVERLAPPING:
-        return objects.translation
-    near_first, near_second = _near_pairs(collider, objects)
-    overlapping = np.concatenate([first, second])
-    kept = np.isin(near_first, overlapping) | np.isin(near_second, overlapping)
-    # Fixed objects are always among them: boards above limit how far an object can be lifted.
-    rows = np.unique(np.concatenate([near_first[kept], near_second[kept], np.flatnonzero(objects.fixed)]))
-    some = objects[rows]
-    one, other = np.searchsorted(rows, first), np.searchsorted(rows, second)
-    near = np.searchsorted(rows, near_first[kept]), np.searchsorted(rows, near_second[kept])
-    bounds = _bounds(some.translation, some, workspace)
-    home, walls, budget = some.translation, _walls(bounds), Budget(WORK)
-    result = objects.translation.copy()
-    result[rows] = _round(collider, some, home, one, other, near, bounds, walls, {}, budget, cost)
-    return result
-
-
-def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -> Projection:
-    """The nearest translations without overlap that a bounded number of rounds finds."""
-    home, walls, budget = objects.translation, _walls(bounds), Budget(WORK)
-    best, best_way = None, np.inf
-    waited = refinements = 0
-    tried: Tried = {}
-    current = replace(objects, translation=nearest(objects, home, walls, budget))
-    for _ in range(_ROUNDS):
-        first, second, measured = _measure(collider, current, budget)
-        way = float(((current.translation - home) ** 2).sum())
-        is_free = measured.residual_depth <= 0.5 * TOLERANCE
-        gain = best_way - way
-        waited += 1
-        if best is None or (measured.total_depth < best.total_depth and not is_free and best_way == np.inf):
-            best, waited = measured, 0
-        if is_free and way < best_way:
-            best, best_way = measured, way
-        if is_free:
-            refinements += 1
-            if refinements > _REFINEMENTS or way < _NEGLIGIBLE or gain < _GAIN * way:
-                break
-        elif waited > _PATIENCE:
-            break
-        elif best_way < np.inf:
-            break  # a refinement led to another overlap: the last result without overlap is kept
-        if budget.is_spent or corner_tests(collider.library, current, first, second).sum() > _OVERLAPPING:
-            break
-        near = _near_pairs(collider, current)
-        translation = _round(collider, current, home, first, second, near, bounds, walls, tried, budget)
-        current = replace(current, translation=translation)
-    assert best is not None
-    inside = _inside(best.translation, bounds)
-    return best if inside is best.translation else _measure(collider, replace(objects, translation=inside), budget)[2]
-
-
-def _round(
-    collider: Collider,
-    current: Objects,
-    home: Array,
-    first: Index,
-    second: Index,
-    near: tuple[Index, Index],
-    bounds: tuple[Array, Array],
-    walls: Planes,
-    tried: Tried,
-    budget: Budget,
-    cost: Array | None = None,
-) -> Array:
-    """The next translations: they free overlapping pairs (``first``, ``second``) and keep other ``near`` ones apart."""
-    near_first, near_second = near
-    extra = np.zeros((len(near_first), 3))
-    if len(first):
-        count = len(current)
-        moves = _minimum_translations(collider, current, first, second, bounds, tried, budget, cost)
-        place_of = np.searchsorted(near_first * count + near_second, first * count + second)
-        extra[place_of] = moves
-    planes = _separating_planes(collider, current, near_first, near_second, extra, home, budget)
-    return nearest(current, home, planes + walls, budget, cost)
-
-
-def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:
-    """Object pairs whose fine parts overlap deeper than half the tolerance, and the overlap of the whole scene."""
-    pairs = collider.pairs(objects)
-    budget.spend(len(pairs.contacts.gap))
-    deep = pairs.depth > 0.5 * TOLERANCE
-    first, second = pairs.first[deep], pairs.second[deep]
-    overlapping = np.isin(np.arange(len(objects)), np.concatenate([first, second]))
-    residual, total = float(pairs.depth.max(initial=0.0)), float(pairs.depth.sum())
-    return first, second, Projection(objects.translation, residual, total, overlapping)
-
-
-def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, Array]:
-    """Lowest and highest translations (n, 3); infinite for fixed objects and for objects far outside."""
-    low, high = np.array(workspace[0]), np.array(workspace[1])
-    loose = objects.fixed | ((home < low - _OUTSIDE) | (home > high + _OUTSIDE)).any(axis=1)
-    return np.where(loose[:, None], -np.inf, low + _INSIDE), np.where(loose[:, None], np.inf, high - _INSIDE)
-
-
-def _inside(translation: Array, bounds: tuple[Array, Array]) -> Array:
-    """The translations; if slack let some leave the workspace, they are put back."""
-    clipped = np.clip(translation, *bounds)
-    return clipped if (np.abs(clipped - translation) > 0.9 * _INSIDE).any() else translation
-
-
-def _walls(bounds: tuple[Array, Array]) -> Planes:
-    """The bounds as half-spaces."""
-    low, high = (np.nonzero(np.isfinite(limit)) for limit in bounds)
-    row, axis = np.concatenate([low[0], high[0]]), np.concatenate([low[1], high[1]])
-    sign = np.repeat([1.0, -1.0], [len(low[0]), len(high[0])])
-    limits = np.concatenate([bounds[0][low], -bounds[1][high]])
-    direction = np.zeros((len(row), 3))
-    direction[np.arange(len(row)), axis] = sign
-    return Planes(np.full(len(row), -1, dtype=np.int64), row, direction, limits)

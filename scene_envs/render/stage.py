@@ -84,10 +84,8 @@ class Stage:
     ) -> None:
         """Move bodies to the objects of one scene, and all others out of sight.
 
-        Args:
-            translations: (N, 3) translations, m.
-            quaternions: (N, 4) quaternions (w, x, y, z).
-            categories: (N,) categories; indices outside the library are empty slots.
+        Poses are translations (N, 3) m and quaternions (N, 4) (w, x, y, z). Slots whose category (N,) is outside the
+        library are empty.
         """
         bullet, used = self._bullet, [0] * len(self._bodies)
         highest = max((body for bodies in self._bodies for body in bodies), default=-1)
@@ -268,13 +266,7 @@ def scene_type_of_one(scene_type: SceneType, translations: Array, rotations: Arr
 
     A union of scene types has no fixed objects and the workspace of the largest type, in which a table would be tiny. A
     scene with one welded object is framed as if this object were fixed there; any other scene is framed as
-    ``scene_type``.
-
-    Args:
-        scene_type: Scene type of the scene.
-        translations: (N, 3) translations, m.
-        rotations: (N, 3, 3) rotations.
-        categories: (N,) int64; the number of assets is the category of empty slots.
+    ``scene_type``. Poses are (N, 3) m and (N, 3, 3); empty slots have the number of assets as category (N,).
     """
     names = np.array([*scene_type.assets, ""])[categories]
     supports = np.flatnonzero(np.isin(names, scene_type.welded))
@@ -298,14 +290,10 @@ def scene_type_of_one(scene_type: SceneType, translations: Array, rotations: Arr
 
 
 def fit_camera(points: Array, to_camera: Array, fov_y: float, aspect: float, margin: float) -> tuple[Array, Array]:
-    """Position and target (m) of the nearest camera without roll that sees all points.
+    """Position and target (m) of the nearest camera without roll that sees all points (P, 3) m.
 
-    Args:
-        points: (P, 3) points, m.
-        to_camera: (3,) unit vector from the scene to the camera; not vertical.
-        fov_y: Vertical field of view, degrees.
-        aspect: Ratio of width to height.
-        margin: Share of the half image that stays free at each border.
+    ``to_camera`` (3,) is a unit vector from the scene to the camera, not vertical; ``fov_y`` the vertical field of view
+    in degrees; ``aspect`` width to height; ``margin`` the share of the half image that stays free at each border.
     """
     right = np.cross(_TOP, to_camera)
     right /= np.linalg.norm(right)

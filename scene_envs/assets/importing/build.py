@@ -225,24 +225,13 @@ class Weight(NamedTuple):
 
 
 def weigh(
-    given: Inertial | None,
-    parts: Sequence[ConvexPart],
-    volume: float,
-    *,
-    mass: float | None = None,
-    density: float | None = None,
+    given: Inertial | None, parts: Sequence[ConvexPart], volume: float, mass: float | None, density: float | None
 ) -> Weight:
     """Mass properties of an asset.
 
-    The file's properties are kept when they can belong to a body of this shape. A user's ``mass`` keeps the
-    file's distribution of mass; a user's ``density`` fills the shape evenly.
-
-    Args:
-        given: Inertial of the file; None when the file has none.
-        parts: Fine convex parts, m.
-        volume: Volume of the shape, m^3.
-        mass: The user's mass, kg.
-        density: The user's density, kg/m^3.
+    The properties ``given`` by the file are kept when they can belong to a body of these fine parts and this ``volume``
+    (m^3). A user's ``mass`` (kg) keeps the file's distribution of mass; a user's ``density`` (kg/m^3) fills the shape
+    evenly.
     """
     if density is not None:
         return Weight(mass_properties(parts, density * volume), (), ())
@@ -375,7 +364,7 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     if entry.welded is None and (entry.mass is not None or entry.density is not None):
         static = False
     given = merged_inertial(model.inertials) if model.inertials else None
-    weight = weigh(given, parts, volume, mass=entry.mass, density=entry.density)
+    weight = weigh(given, parts, volume, entry.mass, entry.density)
     properties = mass_properties(parts, 0.0) if static else weight.properties
     if not static:
         notes += weight.notes
@@ -403,10 +392,8 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     )
     x, y, z = (shift + 0.0).tolist()
     density = 0.0 if static else properties.mass / volume
-    report = AssetReport(
-        entry.name, path, properties.mass, density, len(fine), (x, y, z), tuple(notes), tuple(warnings)
-    )  # fmt: skip
-    return asset, report
+    remarks = tuple(notes), tuple(warnings)
+    return asset, AssetReport(entry.name, path, properties.mass, density, len(fine), (x, y, z), *remarks)
 
 
 def _read(path: Path) -> Model:
@@ -434,9 +421,8 @@ def _scaled(model: Model, entry: AssetEntry) -> Model:
     notes = model.notes
     if scale != 1.0 and any(i.mass > 0 for i in model.inertials) and entry.mass is None and entry.density is None:
         notes = (*notes, f"mass scaled by {scale:g} cubed")
-    return Model(
-        tuple(map(shape, model.visuals)), tuple(map(shape, model.collisions)), inertials, model.static, notes
-    )  # fmt: skip
+    shapes = (tuple(map(shape, some)) for some in (model.visuals, model.collisions))
+    return Model(*shapes, inertials, model.static, notes)
 
 
 def _upright(up: Axis) -> Array:

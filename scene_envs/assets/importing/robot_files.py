@@ -157,9 +157,8 @@ def _sdf_shape(element: Element, pose: Array, path: Path, where: str) -> Shape |
     if kind.tag in _RADII:
         size = [positive(kind.findtext(key), 1, path, f"{kind.tag} {key} of {where}")[0] for key in _RADII[kind.tag]]
         return Shape(kind.tag, tuple(size), pose, where, None, color)  # type: ignore[arg-type]
-    raise CorruptFileError(
-        f"{path}: {where} is a <{kind.tag}>; known are mesh, box, cylinder, sphere, capsule and ellipsoid"
-    )  # fmt: skip
+    known = "mesh, box, cylinder, sphere, capsule and ellipsoid"
+    raise CorruptFileError(f"{path}: {where} is a <{kind.tag}>; known are {known}")
 
 
 def _sdf_inertial(element: Element, path: Path, where: str) -> Inertial:
@@ -197,13 +196,13 @@ def read_urdf(path: Path) -> Model:
         for material in link.findall("visual/material"):
             if material.find("color") is not None:
                 materials[material.get("name", "")] = _own_color(material, path)
-    visuals, collisions, inertials = [], [], []
+    visuals: list[Shape] = []
+    collisions: list[Shape] = []
+    inertials = []
     for name, link in links.items():
-        for index, element in enumerate(link.findall("visual"), start=1):
-            where = f"visual {index} of link {name!r}"
-            visuals.append(_urdf_shape(element, poses[name], materials, path, where))
-        for index, element in enumerate(link.findall("collision"), start=1):
-            collisions.append(_urdf_shape(element, poses[name], {}, path, f"collision {index} of link {name!r}"))
+        for tag, shapes, known in (("visual", visuals, materials), ("collision", collisions, {})):
+            for index, element in enumerate(link.findall(tag), start=1):
+                shapes.append(_urdf_shape(element, poses[name], known, path, f"{tag} {index} of link {name!r}"))
         inertial = link.find("inertial")
         if inertial is not None:
             inertials.append(moved_inertial(poses[name], _urdf_inertial(inertial, path, f"inertial of link {name!r}")))
@@ -279,18 +278,10 @@ def _urdf_shape(element: Element, link: Array, materials: dict[str, Color | None
         return Shape("mesh", sizes, pose, where, find_mesh(filename, path, where), color, convex)
     if kind.tag == "box":
         return Shape("box", positive(kind.get("size"), 3, path, f"box size of {where}"), pose, where, None, color)
-    if kind.tag == "sphere":
-        radius = positive(kind.get("radius"), 1, path, f"sphere radius of {where}")
-        return Shape("sphere", radius, pose, where, None, color)
-    if kind.tag in ("cylinder", "capsule"):
-        sizes = (
-            *positive(kind.get("radius"), 1, path, f"{kind.tag} radius of {where}"),
-            *positive(kind.get("length"), 1, path, f"{kind.tag} length of {where}"),
-        )
-        return Shape("capsule" if kind.tag == "capsule" else "cylinder", sizes, pose, where, None, color)
-    raise CorruptFileError(
-        f"{path}: {where} is a <{kind.tag}>; known are mesh, box, cylinder, sphere and capsule"
-    )  # fmt: skip
+    if kind.tag in _RADII:
+        sizes = tuple(positive(kind.get(k), 1, path, f"{kind.tag} {k} of {where}")[0] for k in _RADII[kind.tag])
+        return Shape(kind.tag, sizes, pose, where, None, color)  # type: ignore[arg-type]
+    raise CorruptFileError(f"{path}: {where} is a <{kind.tag}>; known are mesh, box, cylinder, sphere and capsule")
 
 
 def _urdf_inertial(element: Element, path: Path, where: str) -> Inertial:

@@ -246,16 +246,9 @@ def _has_coacd() -> bool:
 
 
 def run_coacd(vertices: Array, faces: Array, settings: dict[str, Any], what: str) -> list[Array]:
-    """Corners (P, 3) of the convex pieces, from a process that is ended at the time limit of the import.
+    """Corners (P, 3) of the convex pieces of a mesh (V, 3), (F, 3), from a process that ends with the import's time.
 
-    Args:
-        vertices: (V, 3) corners of the mesh.
-        faces: (F, 3) int, rows of ``vertices``.
-        settings: Keywords of ``coacd.run_coacd``.
-        what: Name of the mesh, for messages.
-
-    Raises:
-        InvalidInputError: CoACD took too long, or failed.
+    Raises InvalidInputError when CoACD takes too long, or fails on the mesh called ``what``.
     """
     try:
         return run_apart(f"{__name__}:coacd_pieces", (vertices, faces, settings), seconds_left())  # type: ignore[no-any-return]
