@@ -298,7 +298,7 @@ class World:
             for _ in range(ahead if running else ahead % 2):  # the number of all steps is always even
                 bullet.stepSimulation(physicsClientId=client)
             done += ahead
-            budget.spend(ahead * sum(map(len, running.values())) * settings.iterations / _USUAL_ITERATIONS)
+            budget.spent += ahead * sum(map(len, running.values())) * settings.iterations / _USUAL_ITERATIONS
             leaving = np.zeros(count, dtype=bool)
             for label, rows in list(running.items()):
                 if done < steps and (budget.is_spent or self._is_still(bodies[rows], duration)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -166,11 +166,8 @@ class _Ragged:
 class _Halves:
     """Pairs seen from both sides: half ``2 p`` belongs to the first part of pair ``p``, half ``2 p + 1`` to the second.
 
-    Attributes:
-        owner: (2 P,) part whose features are tested.
-        other: (2 P,) the other part.
-        turn: (3, 3, 2 P) rotation from the owner's frame to the other's.
-        move: (3, 2 P) origin of the owner in the other's frame, m.
+    Of each half, ``owner`` (2 P,) is the part whose features are tested, ``other`` (2 P,) the other one. ``turn``
+    (3, 3, 2 P) and ``move`` (3, 2 P) m lead from the frame of the owner to that of the other.
     """
 
     def __init__(self, placed: PlacedParts, first: Index, second: Index) -> None:
@@ -185,12 +182,9 @@ class _Halves:
 
 
 class _Faces:
-    """The faces of the owners of half pairs, and the deepest corner of the other part under each face.
+    """The faces of the owners of half pairs, from ``start`` (2 P,) of each half on, with their ``normal`` (n,) index.
 
-    Attributes:
-        start: (2 P,) first face of each half pair.
-        normal: (n,) index of the face's normal in the library.
-        support: (n,) number of the deepest corner within its part.
+    ``support`` (n,) is the number of the deepest corner of the other part under each face.
     """
 
     def __init__(self, depths: PenetrationDepth, halves: _Halves) -> None:
@@ -440,10 +434,7 @@ def _boxes_near(low: Array, high: Array, a: Index, b: Index, margin: float, fixe
     return near
 
 
-@lru_cache(maxsize=512)
-def _upper_triangle(count: int) -> tuple[Index, Index]:
-    first, second = np.triu_indices(count, k=1)
-    return first.astype(np.int64), second.astype(np.int64)
+_upper_triangle = lru_cache(maxsize=512)(partial(np.triu_indices, k=1))
 
 
 def scene_pairs(objects: Objects) -> tuple[Index, Index]:

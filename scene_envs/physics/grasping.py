@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 import torch
@@ -146,17 +147,16 @@ class _Hand:
             return free
         owner, rotation, low, high = self._extents(objects, free, back / np.linalg.norm(back))
         open_rows = free
-        for place_along in PLACES:
-            for reach in self.gripper.reaches:
-                if budget.is_spent:
-                    return free[:0]
-                tried = np.flatnonzero(np.isin(owner, open_rows))
-                across = low[tried, 0] + place_along * (high[tried, 0] - low[tried, 0])
-                deep = np.maximum(high[tried, 2] - reach, low[tried, 2])
-                tips = np.stack([across, 0.5 * (low[tried, 1] + high[tried, 1]), deep], axis=1)
-                tips = np.einsum("gij,gj->gi", rotation[tried], tips)
-                good = self._succeed(objects, owner[tried], rotation[tried], tips, budget)
-                open_rows = np.setdiff1d(open_rows, owner[tried[good]])
+        for place_along, reach in product(PLACES, self.gripper.reaches):
+            if budget.is_spent:
+                return free[:0]
+            tried = np.flatnonzero(np.isin(owner, open_rows))
+            across = low[tried, 0] + place_along * (high[tried, 0] - low[tried, 0])
+            deep = np.maximum(high[tried, 2] - reach, low[tried, 2])
+            tips = np.stack([across, 0.5 * (low[tried, 1] + high[tried, 1]), deep], axis=1)
+            tips = np.einsum("gij,gj->gi", rotation[tried], tips)
+            good = self._succeed(objects, owner[tried], rotation[tried], tips, budget)
+            open_rows = np.setdiff1d(open_rows, owner[tried[good]])
         return np.setdiff1d(free, open_rows)
 
     def _extents(self, objects: Objects, rows: Index, back: Array) -> tuple[Index, Array, Array, Array]:
@@ -200,7 +200,7 @@ class _Hand:
         near = ((placed.low[a] < placed.high[b]) & (placed.low[b] < placed.high[a])).all(axis=-1)
         pair, a, b = pair[near], a[near], b[near]
         overlap = np.zeros(len(first), dtype=bool)
-        budget.spend(len(pair))
+        budget.spent += len(pair)
         if budget.is_spent:
             return overlap
         gap, _ = separations(self.collider.library, placed.parts, a, b)

@@ -282,10 +282,6 @@ class Budget:
     limit: float  # number of units at which the work ends
     spent: float = 0.0  # number of units spent so far
 
-    def spend(self, units: float) -> None:
-        """Add ``units`` of work."""
-        self.spent += units
-
     @property
     def is_spent(self) -> bool:
         """Whether the limit is reached."""

@@ -6,6 +6,7 @@ import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import accumulate
 from typing import Any
 
 from scene_envs.assets.base import Asset, AssetLibrary
@@ -72,11 +73,8 @@ class PhysicsPool(WorkerPool):
         Raises:
             SceneEnvsError: the kernel refused (a missing dependency, an unknown asset).
         """
-        tasks: list[Task] = []
-        total = 0
-        for chunk in chunks:
-            tasks.append(self._task(kernel, chunk, dict(options), total))
-            total += len(chunk)
+        firsts = accumulate(map(len, chunks), initial=0)
+        tasks = [self._task(kernel, chunk, dict(options), first) for chunk, first in zip(chunks, firsts, strict=False)]
         rows: list[dict[str, Any] | None] = []
         for result in self.map(tasks):
             if isinstance(result, WorkerFailure):

@@ -227,7 +227,7 @@ def _round(
 def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:
     """Object pairs whose fine parts overlap deeper than half the tolerance, and the overlap of the whole scene."""
     pairs = collider.pairs(objects)
-    budget.spend(len(pairs.contacts.gap))
+    budget.spent += len(pairs.contacts.gap)
     deep = pairs.depth > 0.5 * TOLERANCE
     first, second = pairs.first[deep], pairs.second[deep]
     overlapping = np.isin(np.arange(len(objects)), np.concatenate([first, second]))
@@ -303,12 +303,12 @@ def _separating_planes(
     elsewhere. ``extra`` (P, 3) m is added to the offset of each pair: the minimum translation of those that overlap.
     """
     coarse, pair, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
-    budget.spend(len(pair))
+    budget.spent += len(pair)
     nested = np.unique(pair[~apart])
     if not len(nested):
         return coarse
     fine, _, _ = _planes_at("fine", collider, objects, first[nested], second[nested], extra[nested], home)
-    budget.spend(len(fine.bound))
+    budget.spent += len(fine.bound)
     return coarse[~np.isin(pair, nested)] + fine
 
 
@@ -384,7 +384,7 @@ def least_distance(matrix: Array, needed: Array, budget: Budget) -> Array:
     while broken.any() and not budget.is_spent:
         used = used | broken
         rows = np.flatnonzero(used)
-        budget.spend(min(len(rows), _EXACT) ** 2 / _ROWS_SQUARED)
+        budget.spent += min(len(rows), _EXACT) ** 2 / _ROWS_SQUARED
         x = _exact(matrix[rows], needed[rows]) if len(rows) <= _EXACT else _approximate(matrix[rows], needed[rows])
         broken = ~used & (matrix @ x < needed - _MET)
     return x
@@ -445,7 +445,7 @@ def _minimum_translations(
     pair, a, b = part_pairs(placed, first, second)
     near = ((placed.low[a] <= placed.high[b] + _AROUND) & (placed.low[b] <= placed.high[a] + _AROUND)).all(axis=1)
     pair, a, b = pair[near], a[near], b[near]
-    budget.spend(len(pair))
+    budget.spent += len(pair)
     offset = objects.translation[second] - objects.translation[first]
     groups = list(grouped_gaps(collider.library, placed.parts, a, b, offset[pair]))
     walk = _walk(objects, first, second, pair, groups, bounds)

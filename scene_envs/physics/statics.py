@@ -398,6 +398,4 @@ def _face_center(objects: Objects, rows: Index, faces: _Faces) -> Array:
     """(P, 3) world position of each object's face centre; NaN where it has none."""
     category = objects.category[rows]
     local = np.column_stack([faces.center[category], faces.height[category]])
-    r = objects.rotation[rows]
-    moved = r[:, :, 0] * local[:, 0:1] + r[:, :, 1] * local[:, 1:2] + r[:, :, 2] * local[:, 2:3]
-    return moved + objects.translation[rows]  # type: ignore[no-any-return]
+    return apply(objects.rotation[rows], local) + objects.translation[rows]

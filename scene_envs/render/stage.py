@@ -420,12 +420,8 @@ def surface_normals(frame: Frame) -> Image:
 def soft_shadow(frame: Frame, light: Frame, normals: Image, *, bias: float = 0.004, lift: float = 0.008) -> Image:
     """(H, W) in 0..1: the part of the light that nearer objects hide, by percentage-closer filtering.
 
-    Args:
-        frame: Frame of the camera.
-        light: Frame of the same scene seen from the light.
-        normals: (H, W, 3) normals from :func:`surface_normals`.
-        bias: Smallest difference in distance from the light (m) between an occluder and the point.
-        lift: Distance (m) by which points are raised off their surface, so that no surface shadows itself.
+    ``light`` is the frame of the same scene seen from the light. An occluder is nearer to it than the point by at least
+    ``bias`` (m). Points are raised off their surface by ``lift`` (m), so that no surface shadows itself.
     """
     seen = np.isfinite(frame.depth)
     to_light = (light.view @ np.linalg.inv(frame.view)).astype(np.float32)

@@ -133,24 +133,15 @@ def cache_folder() -> Path:
 def convex_parts(
     mesh: trimesh.Trimesh, method: Method, tolerance: float, threshold: float, what: str
 ) -> tuple[list[ConvexPart], list[str], list[str]]:
-    """The convex parts of one mesh.
+    """The convex parts of one mesh (m), with notes and warnings; no parts when the mesh spans no volume.
 
-    Closed bodies are taken one by one: convex ones keep their shape, concave ones are decomposed. A surface
-    that is not closed is decomposed as a whole.
+    Closed bodies are taken one by one: convex ones, whose depth below their hull is at most ``tolerance`` (m), keep
+    their shape, concave ones are decomposed. A surface that is not closed is decomposed as a whole. ``threshold`` is
+    CoACD's concavity, relative to the size of the body; ``what`` names the mesh in messages.
 
     Args:
-        mesh: Triangles, m.
-        method: ``"convex"`` takes one hull of the whole mesh; ``"coacd"`` requires CoACD where a body is concave;
-            ``"auto"`` falls back to a hull where CoACD is not installed.
-        tolerance: Largest depth below its hull (m) of a body that counts as convex.
-        threshold: CoACD's concavity, relative to the size of the body.
-        what: Name of the mesh, for messages.
-
-    Returns:
-        Parts, notes and warnings; no parts when the mesh spans no volume.
-
-    Raises:
-        MissingDependencyError: ``"coacd"`` without the package.
+        method: ``"convex"`` takes one hull of the whole mesh; ``"coacd"`` requires CoACD where a body is concave, or
+            raises MissingDependencyError; ``"auto"`` falls back to a hull where CoACD is not installed.
     """
     surface = bare(mesh)
     if not len(surface.faces) or not has_volume(np.asarray(surface.vertices)):

@@ -33,15 +33,11 @@ def revolve(
     segments: int = 32,
     swell: Callable[[Array, Array], Array] | None = None,
 ) -> trimesh.Trimesh:
-    """Revolve a smooth half section about z and paint it cell by cell.
+    """Revolve a smooth half section (P, 2), points (r, z) m, about z and paint it cell by cell.
 
-    Args:
-        profile: (P, 2) points (r, z), m, with the outside on the right, as for
-            :func:`~scene_envs.assets.shapes.lathe`.
-        colors: Colours that ``paint`` chooses from.
-        paint: Function from angle and height of the middle of a cell to the index of its colour.
-        segments: Number of cells around the axis.
-        swell: Function from angle (rad) and height (m) to a factor on the radius, for lobes and spouts.
+    The outside is on the right of the profile, as for :func:`~scene_envs.assets.shapes.lathe`. ``paint`` chooses from
+    ``colors`` by angle and height of the middle of a cell. ``swell`` is a factor on the radius by angle (rad) and
+    height (m), for lobes and spouts.
     """
     section = np.asarray(profile, dtype=np.float64)
     angles = 2.0 * np.pi * np.arange(segments) / segments
@@ -58,34 +54,23 @@ def revolve(
 
 
 def sleeve(radius: float, levels: ArrayLike, colors: Sequence[Color]) -> trimesh.Trimesh:
-    """The wall of a cylinder in bands whose edges may wave.
+    """The wall of a cylinder of ``radius`` m in K - 1 coloured bands whose edges may wave.
 
-    Args:
-        radius: Radius of the cylinder, m.
-        levels: (K, segments) heights (m) of the edges of the bands, bottom first, one per angle.
-        colors: K - 1 colours.
+    ``levels`` (K, segments) are the heights (m) of the edges of the bands, bottom first, one per angle.
     """
     heights = np.asarray(levels, dtype=np.float64)
     unit = circle(heights.shape[1])
-    points = np.stack(
-        [
-            np.broadcast_to(radius * unit[:, 0], heights.shape),
-            np.broadcast_to(radius * unit[:, 1], heights.shape),
-            heights,
-        ],
-        axis=-1,
-    )
+    x, y = (np.broadcast_to(radius * unit[:, axis], heights.shape) for axis in (0, 1))
+    points = np.stack([x, y, heights], axis=-1)
     normals = np.broadcast_to(np.column_stack([unit, np.zeros(len(unit))]), points.shape)
     bands = np.repeat(np.arange(len(heights) - 1)[:, None], heights.shape[1], axis=1)
     return _painted(points, normals, bands, colors)
 
 
 def loft(loops: ArrayLike, colors: Sequence[Color]) -> trimesh.Trimesh:
-    """A closed body between convex outlines, all counter-clockwise seen from above, bottom first.
+    """A closed body between convex outlines (K, P, 3) m, all counter-clockwise seen from above, bottom first.
 
-    Args:
-        loops: (K, P, 3) outlines, m; the first and the last are flat and filled in.
-        colors: K + 1 colours: the underside, K - 1 walls, the top.
+    The first and the last outline are flat and filled in. Colours: the underside, K - 1 walls, the top.
     """
     outlines = np.asarray(loops, dtype=np.float64)
     skins = []
