@@ -19,7 +19,6 @@ from scene_envs.scene_types import SceneType
 _LOGGER = logging.getLogger(__name__)
 _FALLEN = 1.0
 """Objects further than this (m) below the workspace have fallen off, and are simulated no further."""
-Kernel = Callable[..., dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -207,7 +206,7 @@ def _scatter(chunk: Chunk, objects: Objects, values: NDArray[Any]) -> NDArray[An
     return out
 
 
-KERNELS: dict[str, Kernel] = {
+KERNELS: dict[str, Callable[..., dict[str, Any]]] = {
     "feasibility": feasibility_kernel,
     "equilibrium": equilibrium_kernel,
     "penetration": penetration_kernel,

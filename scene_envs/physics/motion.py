@@ -149,7 +149,13 @@ def advance(
         hits = _meetings(physics, objects, pairs, due, group, left, moved)
         if hits is None:
             break
-        due = _merge(objects, pairs, group, *hits)
+        touched = np.zeros(len(objects), dtype=bool)
+        touched[np.concatenate(hits)] = True
+        touched |= np.isin(group, group[touched & (group >= 0)])
+        due = company(objects, pairs, touched)
+        due |= np.isin(group, group[due & (group >= 0)])
+        # one cluster for all of these few objects; those that were at rest are at rest again
+        group[due] = int(group.max()) + 1
     return moved
 
 
@@ -226,19 +232,6 @@ def _meetings(
     if not ((group[second] < 0) | left[second] | ~due[second]).any():
         return None
     return first, second
-
-
-def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, second: Index) -> Mask:
-    """Join the clusters of objects that met, in ``group`` in place; returns the objects to simulate again (n,)."""
-    count = len(objects)
-    touched = np.zeros(count, dtype=bool)
-    touched[first] = touched[second] = True
-    touched |= np.isin(group, group[touched & (group >= 0)])
-    due = company(objects, pairs, touched)
-    due |= np.isin(group, group[due & (group >= 0)])
-    # one cluster for all of these few objects; those that were at rest are at rest again
-    group[due] = int(group.max()) + 1
-    return due
 
 
 def settings_for(height: int) -> SolverSettings:

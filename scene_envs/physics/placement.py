@@ -259,9 +259,10 @@ class ObjectPairs:
         number[rows] = np.arange(len(rows))
         first, second = number[self.first], number[self.second]
         kept = (first >= 0) & (second >= 0)
-        columns = self.gap, self.direction, self.depth, self.total, self.part_count
-        pairs = (column[kept] for column in (first, second, *columns))
-        return ObjectPairs(*pairs, self.low[rows], self.high[rows], self.contacts.among(number), self.rough[kept])
+        first, second, low, high = first[kept], second[kept], self.low[rows], self.high[rows]
+        gap, direction, depth, total = (column[kept] for column in (self.gap, self.direction, self.depth, self.total))
+        count, contacts, rough = self.part_count[kept], self.contacts.among(number), self.rough[kept]
+        return ObjectPairs(first, second, gap, direction, depth, total, count, low, high, contacts, rough)
 
     def deepest(self) -> Array:
         """(n,) m, the deepest overlap of each object."""

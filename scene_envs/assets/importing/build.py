@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from scene_envs.assets.importing.mesh_files import (
 )
 from scene_envs.assets.importing.robot_files import read_sdf, read_urdf
 from scene_envs.assets.importing.solids import (
-    METHODS,
     Method,
     collision_of,
     enclosing_hull,
@@ -46,12 +45,14 @@ YAML_NAMES = ("library.yaml", "library.yml")
 SUFFIXES = (".urdf", ".sdf", *MESH_SUFFIXES)
 """Files that can become assets."""
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
-AXES: tuple[Axis, ...] = ("x", "y", "z", "-x", "-y", "-z")
 Base = Literal["bottom", "origin"]
-BASES: tuple[Base, ...] = ("bottom", "origin")
 _TEXTS = ("file", "name", "display_name", "plural")
 _NUMBERS = ("scale", "density", "mass", "concavity")
-_CHOICES: Mapping[str, tuple[str, ...]] = {"up": AXES, "base": BASES, "decomposition": METHODS}
+_CHOICES: Mapping[str, tuple[str, ...]] = {
+    "up": get_args(Axis),
+    "base": get_args(Base),
+    "decomposition": get_args(Method),
+}
 DEFAULT_DENSITY = 500.0
 """Density (kg/m^3) used where neither the file nor the user gives one: wood, or a ceramic vessel with its air."""
 _POSSIBLE = (1.0, 23_000.0)
@@ -153,7 +154,6 @@ def _named(values: dict[str, Any]) -> AssetEntry:
     values.setdefault("name", "_".join(file.stem.split()))
     values.setdefault("display_name", " ".join(values["name"].replace("_", " ").split()) or values["name"])
     values.setdefault("plural", regular_plural(values["display_name"]))
-    values.setdefault("up", "z")
     return AssetEntry(**values)
 
 

@@ -36,7 +36,6 @@ _COARSE_CORNERS = 16
 _DIRECTIONS = np.array(list(np.ndindex(3, 3, 3)), dtype=np.float64) - 1.0
 """Directions to the 26 neighbours of a cell, and the zero vector."""
 Method = Literal["auto", "coacd", "convex"]
-METHODS: tuple[Method, ...] = ("auto", "coacd", "convex")
 _LOGGER = logging.getLogger(__name__)
 _VERSION = 2
 """Version of the format on disk."""

@@ -33,6 +33,39 @@ _GLAZE: Color = (252, 251, 247)
 _RUBY: Color = (164, 40, 52)
 _SLATE: Color = (74, 104, 118)
 _SHALLOW: Color = (222, 232, 232)
+_SIDES = 12
+_SILVER: Color = (196, 199, 204)
+_BRUSHED: Color = (172, 176, 182)
+_SHADE: Color = (140, 144, 150)
+_COLA: Color = (206, 28, 36)
+_WAVE: Color = (250, 248, 244)
+_CAN_RADIUS, _CAN_HEIGHT = 0.0334, 0.122
+_TEA: Color = (176, 108, 44)
+_GLASS: Color = (196, 132, 60)
+_LABEL: Color = (64, 128, 70)
+_CREAM: Color = (236, 240, 216)
+_CAP: Color = (46, 92, 58)
+_LABEL_RADIUS = 0.0325
+_BODY = [(0.0325, 0.0), (0.0325, 0.140), (0.015, 0.176)]
+_NECK = [(0.015, 0.176), (0.015, 0.208)]
+# the steamer and its lid, m
+_RADIUS, _HEIGHT, _WALL = 0.12, 0.091, 0.009
+_FLOOR = (0.008, 0.014)
+_LID_HEIGHT, _LID_RIM, _LID_TOP, _LID_WALL = 0.06, 0.018, 0.042, 0.012
+_BAMBOO: Color = (238, 203, 152)
+_BAND: Color = (203, 153, 96)
+_INNER: Color = (242, 213, 168)
+_SLATS: tuple[Color, Color] = ((240, 208, 158), (222, 183, 128))
+_TEA_PORCELAIN: Color = (248, 246, 241)
+_INSIDE: Color = (226, 238, 232)
+_COBALT: Color = (48, 84, 150)
+_FOOT: Color = (206, 196, 180)
+_CUP_RADIUS, _CUP_FOOT, _CUP_HEIGHT, _CUP_FLOOR, _CUP_WALL = 0.0425, 0.030, 0.07, 0.006, 0.005
+_CUP_HANDLE = [(0.0385, 0.0, 0.056), (0.061, 0.0, 0.054), (0.061, 0.0, 0.030), (0.0345, 0.0, 0.022)]
+_POT_BODY = [(0.052, 0.0), (0.075, 0.045), (0.066, 0.090), (0.036, 0.118)]
+_POT_SPOUT = [(0.066, 0.0, 0.045), (0.083, 0.0, 0.070), (0.0945, 0.0, 0.108)]
+_POT_HANDLE = [(-0.062, 0.0, 0.098), (-0.086, 0.0, 0.104), (-0.095, 0.0, 0.080), (-0.089, 0.0, 0.052),
+               (-0.068, 0.0, 0.036)]  # fmt: skip
 
 
 @asset_recipe("dinner_plate", display_name="plate", mass=0.60, color=(214, 74, 66))
@@ -73,9 +106,6 @@ def serving_dish() -> Model:
         flat=True,
     )
     return Model(join(visual), [base, *rim], [hull_of([base, *rim])])
-
-
-_SIDES = 12
 
 
 def _bowl(
@@ -129,15 +159,6 @@ def fruit_bowl() -> Model:
     )  # fmt: skip
 
 
-_SILVER: Color = (196, 199, 204)
-_BRUSHED: Color = (172, 176, 182)
-_SHADE: Color = (140, 144, 150)
-_COLA: Color = (206, 28, 36)
-_WAVE: Color = (250, 248, 244)
-
-_CAN_RADIUS, _CAN_HEIGHT = 0.0334, 0.122
-
-
 @asset_recipe("soda_can", display_name="coke can", mass=0.37, color=(255, 0, 0))
 def soda_can() -> Model:
     """A red can with a white wave."""
@@ -173,17 +194,6 @@ def _lid(z: float) -> trimesh.Trimesh:
     return join(at(mouth, 0.0, _SHADE), at(ring, 0.0012, _SILVER), at(hole, 0.0016, _SHADE))
 
 
-_TEA: Color = (176, 108, 44)
-_GLASS: Color = (196, 132, 60)
-_LABEL: Color = (64, 128, 70)
-_CREAM: Color = (236, 240, 216)
-_CAP: Color = (46, 92, 58)
-
-_LABEL_RADIUS = 0.0325
-_BODY = [(0.0325, 0.0), (0.0325, 0.140), (0.015, 0.176)]
-_NECK = [(0.015, 0.176), (0.015, 0.208)]
-
-
 @asset_recipe("tea_bottle", display_name="tea bottle", mass=0.53, color=(10, 70, 110))
 def tea_bottle() -> Model:
     """A bottle of tea with a green label and cap."""
@@ -209,15 +219,6 @@ def tea_bottle() -> Model:
     levels = [np.full(48, 0.054), middle - leaf, middle, middle + leaf, np.full(48, 0.106)]
     label = sleeve(_LABEL_RADIUS, levels, [_CREAM, _LABEL, _CAP, _CREAM])
     return Model(join(glass, label, shoulder), [body, neck], [body, neck])
-
-
-_RADIUS, _HEIGHT, _WALL = 0.12, 0.091, 0.009
-_FLOOR = (0.008, 0.014)
-_LID_HEIGHT, _LID_RIM, _LID_TOP, _LID_WALL = 0.06, 0.018, 0.042, 0.012
-_BAMBOO: Color = (238, 203, 152)
-_BAND: Color = (203, 153, 96)
-_INNER: Color = (242, 213, 168)
-_SLATS: tuple[Color, Color] = ((240, 208, 158), (222, 183, 128))
 
 
 @asset_recipe("steamer_bottom", display_name="steamer bottom", mass=0.35, color=(224, 172, 88))
@@ -261,20 +262,6 @@ def steamer_lid() -> Model:
         ),
     )
     return Model(visual, [*rim, cap, knob], [hull_of([*rim, cap]), knob])
-
-
-_TEA_PORCELAIN: Color = (248, 246, 241)
-_INSIDE: Color = (226, 238, 232)
-_COBALT: Color = (48, 84, 150)
-_FOOT: Color = (206, 196, 180)
-
-_CUP_RADIUS, _CUP_FOOT, _CUP_HEIGHT, _CUP_FLOOR, _CUP_WALL = 0.0425, 0.030, 0.07, 0.006, 0.005
-_CUP_HANDLE = [(0.0385, 0.0, 0.056), (0.061, 0.0, 0.054), (0.061, 0.0, 0.030), (0.0345, 0.0, 0.022)]
-
-_POT_BODY = [(0.052, 0.0), (0.075, 0.045), (0.066, 0.090), (0.036, 0.118)]
-_POT_SPOUT = [(0.066, 0.0, 0.045), (0.083, 0.0, 0.070), (0.0945, 0.0, 0.108)]
-_POT_HANDLE = [(-0.062, 0.0, 0.098), (-0.086, 0.0, 0.104), (-0.095, 0.0, 0.080), (-0.089, 0.0, 0.052),
-               (-0.068, 0.0, 0.036)]  # fmt: skip
 
 
 @asset_recipe("teacup", display_name="cup", mass=0.20, color=(168, 94, 196))

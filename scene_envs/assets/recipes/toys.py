@@ -35,6 +35,9 @@ _RINGS: list[tuple[float, Color]] = [
 _BASE, _RING, _HEIGHT = 0.012, 0.019, 0.13
 _TO_X = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 """Turns the z axis to +x."""
+# game boxes
+_CARD: Color = (226, 220, 208)
+_WHITE: Color = (248, 246, 240)
 
 
 def _bulge(radius: float, z: float, height: float, rounding: float, samples: int) -> Profile:
@@ -112,10 +115,6 @@ def toy_train() -> Model:
         ),
     )  # fmt: skip
     return Model(visual, [wheels, body, cab, boiler], [hull_of([wheels, body]), hull_of([cab, boiler])])
-
-
-_CARD: Color = (226, 220, 208)
-_WHITE: Color = (248, 246, 240)
 
 
 def _lidded(
