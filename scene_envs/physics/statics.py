@@ -37,10 +37,8 @@ _SAME_DEPTH = 1e-4
 """Coarse and fine overlap may differ by this much (m) and still act alike."""
 _UPRIGHT = 0.999
 """Cosine of the tilt up to which faces count as facing each other."""
-_CLEAR = 0.01
-_CLEAR_ABOVE = 0.06
-"""Objects are simulated in one cluster when they are within ``_CLEAR`` (m) of each other sideways and within
-``_CLEAR_ABOVE`` (m) in height."""
+_CLEAR = np.array([0.01, 0.01, 0.06])
+"""Objects are simulated in one cluster when they are within this (m) of each other along each axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,13 +357,12 @@ class Support:
         return depth
 
 
-def clusters(objects: Objects, low: Array, high: Array, sideways: float = _CLEAR) -> Index:
+def clusters(objects: Objects, low: Array, high: Array) -> Index:
     """(n,) a number per free object of one scene, shared by those near each other; -1 for fixed ones."""
     rows = np.flatnonzero(~objects.fixed)
-    margin = np.array([sideways, sideways, _CLEAR_ABOVE])
     first, second = np.triu_indices(len(rows), k=1)
     first, second = rows[first], rows[second]
-    near = ((low[first] <= high[second] + margin) & (low[second] <= high[first] + margin)).all(axis=1)
+    near = ((low[first] <= high[second] + _CLEAR) & (low[second] <= high[first] + _CLEAR)).all(axis=1)
     return np.where(objects.fixed, -1, components(len(objects), first[near], second[near]))
 
 

@@ -48,11 +48,7 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Base = Literal["bottom", "origin"]
 _TEXTS = ("file", "name", "display_name", "plural")
 _NUMBERS = ("scale", "density", "mass", "concavity")
-_CHOICES: Mapping[str, tuple[str, ...]] = {
-    "up": get_args(Axis),
-    "base": get_args(Base),
-    "decomposition": get_args(Method),
-}
+_CHOICES = {key: get_args(kind) for key, kind in (("up", Axis), ("base", Base), ("decomposition", Method))}
 DEFAULT_DENSITY = 500.0
 """Density (kg/m^3) used where neither the file nor the user gives one: wood, or a ceramic vessel with its air."""
 _POSSIBLE = (1.0, 23_000.0)
@@ -421,8 +417,8 @@ def _scaled(model: Model, entry: AssetEntry) -> Model:
     notes = model.notes
     if scale != 1.0 and any(i.mass > 0 for i in model.inertials) and entry.mass is None and entry.density is None:
         notes = (*notes, f"mass scaled by {scale:g} cubed")
-    shapes = (tuple(map(shape, some)) for some in (model.visuals, model.collisions))
-    return Model(*shapes, inertials, model.static, notes)
+    visuals, collisions = (tuple(map(shape, some)) for some in (model.visuals, model.collisions))
+    return Model(visuals, collisions, inertials, model.static, notes)
 
 
 def _upright(up: Axis) -> Array:
