@@ -60,18 +60,10 @@ class PhysicsPool(WorkerPool):
         self._scene_types: dict[tuple[SceneType, tuple[int, ...]], tuple[int, tuple[Asset, ...]]] = {}
 
     def run(self, kernel: str, chunks: Sequence[Chunk], options: Mapping[str, Any]) -> list[dict[str, Any] | None]:
-        """Run a kernel on every chunk.
+        """Run a kernel of ``scene_envs.physics.kernels.KERNELS`` with its options on chunks of one scene type.
 
-        Args:
-            kernel: name of a function of ``scene_envs.physics.kernels.KERNELS``.
-            chunks: scenes, all of one scene type.
-            options: keyword arguments of the kernel.
-
-        Returns:
-            One result per *scene*, in order; each holds one row, or is None where the scene failed twice.
-
-        Raises:
-            SceneEnvsError: the kernel refused (a missing dependency, an unknown asset).
+        Returns one result per *scene*, in order: a row of each array of the kernel, or None where the scene failed
+        twice. Raises SceneEnvsError where the kernel refuses (a missing dependency, an unknown asset).
         """
         firsts = accumulate(map(len, chunks), initial=0)
         tasks = [self._task(kernel, chunk, dict(options), first) for chunk, first in zip(chunks, firsts, strict=False)]

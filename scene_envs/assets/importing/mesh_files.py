@@ -340,9 +340,7 @@ def _corner_normals(mesh: trimesh.Trimesh) -> Array:
 def read_xml(path: Path) -> Element:
     """The root element of an XML file; prefixes that are never declared are tolerated.
 
-    Raises:
-        CorruptFileError: the file cannot be read or is not XML; the line is named.
-        InvalidInputError: the file is larger than imports may be.
+    Raises CorruptFileError, with the line, for a file that cannot be read or is no XML, and as :func:`check_file` does.
     """
     check_file(path)
     try:
@@ -361,11 +359,7 @@ def read_xml(path: Path) -> Element:
 
 
 def numbers(text: str | None, count: int, path: Path, where: str, default: tuple[float, ...] | None = None) -> Array:
-    """``count`` finite numbers from text; ``default`` when there is none.
-
-    Raises:
-        CorruptFileError: the text is anything else; file and place are named.
-    """
+    """``count`` finite numbers from text, ``default`` when there is none; CorruptFileError for anything else."""
     if text is None or not text.strip():
         if default is None:
             raise CorruptFileError(f"{path}: {where} is missing; it needs {count} number{'s' if count > 1 else ''}")
