@@ -32,8 +32,8 @@ _ZERO = (0.0, 0.0, 0.0)
 def read_sdf(path: Path) -> Model:
     """The model in an SDF file, in the model frame; the pose of the model in its world is ignored.
 
-    Raises CorruptFileError for a file that is no SDF or contradicts itself, and InvalidInputError for several models, an
-    include, or a mesh that does not exist.
+    Raises CorruptFileError for a file that is no SDF or contradicts itself, and InvalidInputError for several models,
+    an include, or a mesh that does not exist.
     """
     model = _only_model(path)
     links = {link.get("name", ""): link for link in model.findall("link")}
