@@ -9,9 +9,8 @@ from scene_envs.assets.base import (
     asset_recipe,
     register_asset_group,
 )
-from scene_envs.assets.built_in import list_assets
 from scene_envs.assets.importing import AssetReport, ImportReport, import_report, load_library
-from scene_envs.assets.library import get_library
+from scene_envs.assets.library import get_library, list_assets
 
 __all__ = [
     "ASSET_GROUPS",

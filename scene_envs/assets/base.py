@@ -16,6 +16,26 @@ from scene_envs.errors import InvalidInputError, unknown_name
 if TYPE_CHECKING:
     import trimesh
 
+_FRUIT = (
+    "apple_gala", "apple_golden", "apple_green", "apple_red", "avocado_a", "avocado_b", "avocado_c", "pear_anjou",
+    "pear_bosc", "pear_red",
+)  # fmt: skip
+ASSET_GROUPS: dict[str, frozenset[str]] = {
+    "fruit": frozenset(_FRUIT),
+    "edible": frozenset((*_FRUIT, "bread_slice", "cereal_box")),
+    "drinks": frozenset(("soda_can", "tea_bottle", "water_jug")),
+    "dishes": frozenset(("bowl", "dinner_plate", "fruit_bowl", "plate", "serving_dish", "shared_plate")),
+    "cups": frozenset(("mug", "teacup")),
+    "cutlery": frozenset(("dinner_spoon", "fork", "knife", "teaspoon")),
+    "steamers": frozenset(("steamer_bottom", "steamer_lid")),
+    "games": frozenset(("board_game_l", "board_game_l2", "board_game_s", "board_game_xl", "game_case")),
+    "toys": frozenset(("stacking_ring", "toy_train")),
+    "furniture": frozenset(("breakfast_table", "cafe_table", "chair", "floor", "shelf")),
+}
+"""Names of assets by group."""
+RECIPES: dict[str, RecipeEntry] = {}
+"""Recipes registered so far, by asset name."""
+
 
 def indefinite_article(name: str) -> str:
     """The indefinite article of a noun, by sound.
@@ -145,26 +165,6 @@ class AssetLibrary:
         return tuple(asset.name for asset in self.assets)
 
 
-_FRUIT = (
-    "apple_gala", "apple_golden", "apple_green", "apple_red", "avocado_a", "avocado_b", "avocado_c", "pear_anjou",
-    "pear_bosc", "pear_red",
-)  # fmt: skip
-
-ASSET_GROUPS: dict[str, frozenset[str]] = {
-    "fruit": frozenset(_FRUIT),
-    "edible": frozenset((*_FRUIT, "bread_slice", "cereal_box")),
-    "drinks": frozenset(("soda_can", "tea_bottle", "water_jug")),
-    "dishes": frozenset(("bowl", "dinner_plate", "fruit_bowl", "plate", "serving_dish", "shared_plate")),
-    "cups": frozenset(("mug", "teacup")),
-    "cutlery": frozenset(("dinner_spoon", "fork", "knife", "teaspoon")),
-    "steamers": frozenset(("steamer_bottom", "steamer_lid")),
-    "games": frozenset(("board_game_l", "board_game_l2", "board_game_s", "board_game_xl", "game_case")),
-    "toys": frozenset(("stacking_ring", "toy_train")),
-    "furniture": frozenset(("breakfast_table", "cafe_table", "chair", "floor", "shelf")),
-}
-"""Names of assets by group."""
-
-
 def register_asset_group(name: str, assets: Iterable[str]) -> None:
     """Make ``name`` stand for several assets wherever assets are named; a group of that name is replaced.
 
@@ -232,10 +232,6 @@ class RecipeEntry:
     plural: str
     mass: float
     color: tuple[int, int, int]
-
-
-RECIPES: dict[str, RecipeEntry] = {}
-"""Recipes registered so far, by asset name."""
 
 
 def asset_recipe(

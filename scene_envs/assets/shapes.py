@@ -21,6 +21,12 @@ from scene_envs.errors import InvalidInputError
 
 Profile = Sequence[tuple[float, float]]
 """Points (r, z) of a half section, m."""
+Color = tuple[int, int, int]
+"""(r, g, b) in 0..255."""
+_SMOOTH = np.cos(np.radians(40.0))
+"""Spans of a profile that meet at less than 40 degrees are shaded as one curved surface."""
+Face = Literal["-x", "+x", "-y", "+y", "bottom", "top"]
+FACES: tuple[Face, ...] = ("-x", "+x", "-y", "+y", "bottom", "top")
 
 
 class MassProperties(NamedTuple):
@@ -163,13 +169,6 @@ def mass_properties(parts: Iterable[ConvexPart], mass: float) -> MassProperties:
     return MassProperties(mass, center, 0.5 * (inertia + inertia.T))
 
 
-Color = tuple[int, int, int]
-"""(r, g, b) in 0..255."""
-
-_SMOOTH = np.cos(np.radians(40.0))
-"""Spans of a profile that meet at less than 40 degrees are shaded as one curved surface."""
-
-
 def surface(vertices: ArrayLike, faces: ArrayLike, color: Color, normals: ArrayLike | None = None) -> trimesh.Trimesh:
     """One mesh of one colour; normals (V, 3) default to those of the faces around a vertex."""
     vertices = np.asarray(vertices, dtype=np.float64)
@@ -200,6 +199,17 @@ def quad_faces(count: int) -> NDArray[np.int64]:
 def fan(count: int) -> NDArray[np.int64]:
     """(count - 2, 3): triangles of a convex outline of ``count`` corners."""
     return np.stack([np.zeros(count - 2, dtype=np.int64), np.arange(1, count - 1), np.arange(2, count)], axis=1)
+
+
+def sheet(outline: ArrayLike, color: Color) -> trimesh.Trimesh:
+    """A flat convex face (P, 3), counter-clockwise seen from its front: a lid, a label, a letter's stroke."""
+    points = np.asarray(outline, dtype=np.float64)
+    return surface(points, fan(len(points)), color)
+
+
+def walls(low: Array, high: Array) -> Array:
+    """(P, 4, 3): the quadrilaterals between neighbouring corners of two outlines (P, 3)."""
+    return np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1)
 
 
 def grid_faces(rows: int, around: int) -> NDArray[np.int64]:
@@ -308,10 +318,6 @@ def arc(points: Sequence[tuple[float, float, float]], samples: int = 16) -> Arra
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
     spline = make_interp_spline(length, knots, k=min(3, len(knots) - 1))
     return np.asarray(spline(np.linspace(0.0, length[-1], samples)))
-
-
-Face = Literal["-x", "+x", "-y", "+y", "bottom", "top"]
-FACES: tuple[Face, ...] = ("-x", "+x", "-y", "+y", "bottom", "top")
 
 
 class Patch(NamedTuple):

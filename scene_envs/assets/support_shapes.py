@@ -52,21 +52,21 @@ class LibraryShapes:
 def library_shapes(library: AssetLibrary) -> LibraryShapes:
     """The shapes of ``library``, made once."""
     assets = list(library)
-    maps = [_maps(asset) for asset in assets]
+    top, wide, covered, low, cell = map(np.stack, zip(*map(_maps, assets), strict=True))
     points = [_extreme_points(asset.fine) for asset in assets]
     size = max(len(p) for p in points)
     levels = [_tiers(asset) for asset in assets]
     most = max(1, *(len(level) for level in levels))
-    wells = np.array([_hollow(asset, m) for asset, m in zip(assets, maps, strict=True)])
+    wells = np.array([_hollow(asset, *maps) for asset, *maps in zip(assets, top, wide, low, cell, strict=True)])
     return LibraryShapes(
         points=np.stack([np.concatenate([p, np.repeat(p[:1], size - len(p), axis=0)]).T for p in points]),
         center=np.stack([asset.center_of_mass for asset in assets]),
         bounds=np.stack([asset.bounds for asset in assets]),
-        top=np.stack([m.top for m in maps]),
-        wide=np.stack([m.wide for m in maps]),
-        covered=np.stack([m.covered for m in maps]),
-        low=np.stack([m.low for m in maps]),
-        cell=np.stack([m.cell for m in maps]),
+        top=top,
+        wide=wide,
+        covered=covered,
+        low=low,
+        cell=cell,
         rim=wells[:, 0],
         well=wells[:, 1],
         tiers=np.stack([np.concatenate([level, np.full(most - len(level), np.nan)]) for level in levels]),
@@ -74,17 +74,11 @@ def library_shapes(library: AssetLibrary) -> LibraryShapes:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Maps:
-    top: Array
-    wide: Array
-    covered: Mask
-    low: Array
-    cell: Array
+def _maps(asset: Asset) -> tuple[Array, Array, Mask, Array, Array]:
+    """Height maps ``top``, ``wide``, ``covered``, ``low``, ``cell`` over the asset's outline.
 
-
-def _maps(asset: Asset) -> _Maps:
-    """Height maps over the asset's outline; two cells and a centimetre of margin stay free all round."""
+    Two cells and a centimetre of margin stay free all round.
+    """
     low, high = asset.bounds[:, :2]
     margin = np.maximum(_WIDEN, 3.0 * (high - low) / (_GRID - 6))
     cell = (high - low + 2.0 * margin) / _GRID
@@ -95,7 +89,7 @@ def _maps(asset: Asset) -> _Maps:
     reach = np.maximum(1, np.round(_WIDEN / cell)).astype(int)
     wide = grey_dilation(top, size=tuple(2 * reach + 1), mode="constant", cval=-np.inf)
     wide[[0, -1]], wide[:, [0, -1]] = -np.inf, -np.inf
-    return _Maps(top, wide, binary_fill_holes(np.isfinite(wide)), low, cell)
+    return top, wide, binary_fill_holes(np.isfinite(wide)), low, cell
 
 
 def _upper_side(part: ConvexPart, grid: Array) -> Array:
@@ -126,18 +120,18 @@ def _extreme_points(parts: Iterable[ConvexPart]) -> Array:
     return vertices[np.unique((vertices @ np.concatenate([directions, axes]).T).argmax(axis=0))]
 
 
-def _hollow(asset: Asset, maps: _Maps) -> tuple[float, float]:
+def _hollow(asset: Asset, top: Array, wide: Array, low: Array, cell: Array) -> tuple[float, float]:
     """(rim, well): the lowest way out of the hollow around the centre of mass, and its bottom, m."""
     start = asset.center_of_mass[:2]
     steps = np.linspace(0.0, 1.0, 2 * _GRID) * np.linalg.norm(asset.bounds[1, :2] - asset.bounds[0, :2])
     angles = np.arange(24) * np.pi / 12.0
     rays = start + steps[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)  # (S, 24, 2)
-    cells = np.floor((rays - maps.low) / maps.cell).astype(int)
+    cells = np.floor((rays - low) / cell).astype(int)
     outside = ((cells < 0) | (cells >= _GRID)).any(axis=-1)
     cells[outside] = 0
-    heights = maps.wide[cells[..., 0], cells[..., 1]]
+    heights = wide[cells[..., 0], cells[..., 1]]
     first = cells[0, 0]
-    rim, well = float(heights.max(axis=0).min()), float(maps.top[first[0], first[1]])
+    rim, well = float(heights.max(axis=0).min()), float(top[first[0], first[1]])
     if asset.static or not np.isfinite(well) or rim - well < _HOLLOW:
         return -np.inf, -np.inf
     return rim, well

@@ -29,6 +29,8 @@ SceneWriter = Callable[["PlacedScene", "AssetFiles", Path], Path]
 
 ENTRY_POINT_GROUP = "scene_envs.export_formats"
 """Packages offer formats under this group: an entry named after the format, whose value is a SceneWriter."""
+_HERE = "scene_envs.export"
+MANIFEST = "export.json"
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,6 @@ class ExportFormat:
         return getattr(import_module(module), function)
 
 
-_HERE = "scene_envs.export"
 _SHIPPED = (
     ExportFormat("urdf", "URDF per asset, poses as JSON", f"{_HERE}.urdf:write_scene"),
     ExportFormat("sdf", "SDF world (Gazebo, Drake)", f"{_HERE}.sdf:write_scene"),
@@ -110,15 +111,6 @@ def list_formats() -> list[str]:
     return _FORMATS.names()
 
 
-def get_format(name: str) -> ExportFormat:
-    """The format called ``name``.
-
-    Raises:
-        UnknownNameError: no such format; the nearest known one is offered.
-    """
-    return _FORMATS[name]
-
-
 def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     """Names of formats, each once, from one name, several, or ``"all"`` (those registered that can be written here).
 
@@ -132,7 +124,7 @@ def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     """
     names = check_formats(formats)
     for name in names:
-        get_format(name).writer()
+        _FORMATS[name].writer()
     return names
 
 
@@ -146,11 +138,8 @@ def check_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     if not names:
         raise InvalidInputError(f"formats is empty; give at least one of {', '.join(list_formats())}")
     for name in names:
-        get_format(name).check()
+        _FORMATS[name].check()
     return names
-
-
-MANIFEST = "export.json"
 
 
 @dataclass(frozen=True)
@@ -202,7 +191,7 @@ def export(
     if not 0.0 <= friction < float("inf"):
         raise InvalidInputError(f"friction must be a finite number >= 0, got {friction}")
     names = resolve_formats(formats)
-    writers = {name: get_format(name).writer() for name in names}
+    writers = {name: _FORMATS[name].writer() for name in names}
     placed = place(batch)
     root = Path(output)
     manifest = _claim(root, batch, friction)
@@ -215,9 +204,11 @@ def export(
         folder.mkdir(exist_ok=True)
         scenes.append({name: write(scene, files, folder) for name, write in writers.items()})
     manifest["formats"] = sorted({*manifest["formats"], *names})
-    _write_manifest(root, manifest)
+    write_json(root / MANIFEST, manifest)
     used = tuple(dict.fromkeys(asset.name for scene in placed for asset in scene.assets))
-    return ExportReport(root, names, tuple(scenes), used, _size(root))
+    folders = [root / "assets", *root.glob("scene_[0-9]*")]
+    size = sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
+    return ExportReport(root, names, tuple(scenes), used, size)
 
 
 def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
@@ -252,12 +243,8 @@ def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
         raise InvalidInputError(
             f"{str(root)!r} already holds {taken[0]!r}, which no export wrote; choose an empty folder as output"
         )
-    _write_manifest(root, fresh)
+    write_json(root / MANIFEST, fresh)
     return fresh
-
-
-def _write_manifest(root: Path, manifest: Mapping[str, Any]) -> None:
-    write_json(root / MANIFEST, manifest)
 
 
 def _digest(batch: SceneBatch) -> str:
@@ -271,8 +258,3 @@ def _digest(batch: SceneBatch) -> str:
         for part in asset.fine:
             digest.update(part.vertices.tobytes())
     return digest.hexdigest()[:16]
-
-
-def _size(root: Path) -> int:
-    folders = [root / "assets", *root.glob("scene_[0-9]*")]
-    return sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())

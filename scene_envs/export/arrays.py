@@ -1,4 +1,4 @@
-"""Plain arrays: ``.npz``, and a pickled dictionary for programs that read pickles."""
+"""Files of one scene without physics: ``.npz``, a pickled dictionary of the same arrays, and a coloured ``.glb``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ import trimesh
 from trimesh.exchange.gltf import export_glb
 
 from scene_envs.export.placed import AssetFiles, PlacedScene
+
+Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""World frame (z up) to the frame of glTF (y up)."""
 
 
 def scene_arrays(scene: PlacedScene) -> dict[str, Any]:
@@ -46,10 +49,6 @@ def write_pickle(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     path = folder / "scene.pkl"
     path.write_bytes(pickle.dumps(scene_arrays(scene), protocol=4))
     return path
-
-
-Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""World frame (z up) to the frame of glTF (y up)."""
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:

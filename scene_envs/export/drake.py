@@ -30,22 +30,16 @@ _Dumper.add_representer(float, lambda dumper, value: dumper.represent_scalar("ta
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene.dmd.yaml``; its package is the whole export, whose ``package.xml`` is written here too."""
-    package = write_package(files)
-    directives: list[dict[str, Any]] = []
-    for item in scene.objects:
-        directives += _directives(item, files, package)
+    package = _write_package(files)
+    directives = [directive for item in scene.objects for directive in _directives(item, files, package)]
     path = folder / "scene.dmd.yaml"
     text = yaml.dump({"directives": directives}, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=200)
     path.write_text(text)
     return path
 
 
-def write_package(files: AssetFiles) -> str:
-    """Write ``package.xml`` into the export folder unless it exists; returns the name in it.
-
-    Raises:
-        InvalidInputError: a file of this name exists and names no package.
-    """
+def _write_package(files: AssetFiles) -> str:
+    """Write ``package.xml`` into the export folder unless it exists; returns the name in it."""
     path = files.root.parent / "package.xml"
     if path.exists() and (text := path.read_text().strip()):
         found = re.search(r"<name>\s*([^<\s]+)\s*</name>", text)

@@ -22,6 +22,10 @@ from scene_envs.rotations import matrix_to_quaternion, project_to_so3
 from scene_envs.scene import SceneBatch, require_rigid_poses
 from scene_envs.scene_types import SceneType
 
+_MAX_COLORS = 1024
+_CELL = 4
+"""Width of a colour's cell in the palette, pixels."""
+
 
 @dataclass(frozen=True, eq=False)
 class PlacedObject:
@@ -190,11 +194,6 @@ def numbers(values: Sequence[float] | Array) -> str:
     return " ".join(number(value) for value in np.asarray(values, dtype=np.float64).ravel())
 
 
-_MAX_COLORS = 1024
-_CELL = 4
-"""Width of a colour's cell in the palette, pixels."""
-
-
 class AssetFiles:
     """Writer of asset files; each file is written on first use.
 
@@ -319,19 +318,14 @@ def face_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8]:
     return np.asarray(visual.face_colors)[:, :3].astype(np.uint8)
 
 
-def obj_text(vertices: Array, faces: NDArray[np.int64]) -> str:
-    """A Wavefront file of one mesh without colours; vertices in m."""
-    lines = [f"v {x:.12g} {y:.12g} {z:.12g}" for x, y, z in (vertices + 0.0).tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
-    return "\n".join(lines) + "\n"
-
-
 def _write_parts(parts: Sequence[ConvexPart], folder: Path, prefix: str) -> list[Path]:
+    """Wavefront files of convex parts, in m."""
     paths = []
     for index, part in enumerate(parts):
-        path = folder / f"{prefix}_{index:02d}.obj"
-        path.write_text(obj_text(part.vertices, part.faces))
-        paths.append(path)
+        lines = [f"v {x:.12g} {y:.12g} {z:.12g}" for x, y, z in (part.vertices + 0.0).tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in (part.faces + 1).tolist()]
+        paths.append(folder / f"{prefix}_{index:02d}.obj")
+        paths[-1].write_text("\n".join(lines) + "\n")
     return paths
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,8 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     physics.CreateGravityMagnitudeAttr(GRAVITY)
     for item in scene.objects:
         prim = UsdGeom.Xform.Define(stage, f"/World/{item.name}")
-        prim.GetPrim().GetReferences().AddReference(Sdf.Reference(relative(asset_usd(item.asset, files), folder)))
+        asset_file = files.once(item.asset, "usd", partial(_write_asset, item.asset, files))
+        prim.GetPrim().GetReferences().AddReference(Sdf.Reference(relative(asset_file, folder)))
         prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*item.translation.tolist()))
         w, x, y, z = item.quaternion.tolist()
         prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
@@ -38,12 +40,8 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     return path
 
 
-def asset_usd(asset: Asset, files: AssetFiles) -> Path:
-    """``<name>.usda``: a coloured mesh, and convex colliders of purpose *guide*; the scene's file makes it a body."""
-    return files.once(asset, "usd", lambda folder: _write_asset(asset, files, folder))
-
-
 def _write_asset(asset: Asset, files: AssetFiles, folder: Path) -> Path:
+    """``<name>.usda``: a coloured mesh, and convex colliders of purpose *guide*; the scene's file makes it a body."""
     from pxr import Gf, Sdf, UsdGeom, UsdPhysics, UsdShade, Vt
 
     name = files.name(asset)

@@ -27,20 +27,11 @@ Rows = list[dict[str, Any] | None]
 
 
 def run_kernel(
-    kernel: str,
-    batch: SceneBatch,
-    options: dict[str, Any],
-    pool: PhysicsPool | None,
-    units: Tensor | None = None,
+    kernel: str, batch: SceneBatch, options: dict[str, Any], pool: PhysicsPool | None, units: Tensor | None = None
 ) -> Rows:
-    """Run a kernel on a batch: the results of each scene, None where it failed twice.
+    """Run a kernel of :data:`~scene_envs.physics.kernels.KERNELS`: results of each scene, None where it failed twice.
 
-    Args:
-        kernel: Name of a function of :data:`scene_envs.physics.kernels.KERNELS`.
-        batch: B scenes.
-        options: Keyword arguments of the kernel.
-        pool: Worker processes; None computes in this process.
-        units: (B,) float64, units that the simulation of each scene may spend; None derives them from its objects.
+    ``units`` (B,) float64 are those that the simulation of each scene may spend; None derives them from its objects.
 
     Raises:
         InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
@@ -52,11 +43,8 @@ def run_kernel(
     workers = max(1, pool.workers) if pool else 1
     size = max(1, min(_CHUNK, -(-len(batch) // workers)))
     limits = None if units is None else units.double().cpu().numpy()
-    chunks = []
-    for start in range(0, len(batch), size):
-        rows = slice(start, start + size)
-        some = None if limits is None else limits[rows]
-        chunks.append(Chunk(batch.scene_type, translations[rows], rotations[rows], categories[rows], some))
+    whole = Chunk(batch.scene_type, translations, rotations, categories, limits)
+    chunks = [whole[start : start + size] for start in range(0, len(batch), size)]
     results = (pool or PhysicsPool(workers=0)).run(kernel, chunks, options)
     if lost := sum(row is not None and not row["valid"] for row in results):
         _LOGGER.debug(
@@ -284,16 +272,13 @@ def feasibility(
             limit is negative or NaN, or the duration is not a positive number.
         MissingDependencyError: pybullet is not installed.
     """
-    check_numbers(
-        duration, max_penetration=max_penetration, max_displacement=max_displacement, max_rotation=max_rotation
-    )
-    options = {
+    limits = {
         "max_penetration": max_penetration,
         "max_displacement": max_displacement,
         "max_rotation": max_rotation,
-        "duration": duration,
     }
-    rows = run_kernel("feasibility", batch, options, pool)
+    check_numbers(duration, **limits)
+    rows = run_kernel("feasibility", batch, limits | {"duration": duration}, pool)
     feasible = stack(rows, batch, "feasible", torch.bool) & batch.in_workspace.cpu()
     return FeasibilityResult(
         feasible=feasible,

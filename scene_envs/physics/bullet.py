@@ -1,4 +1,4 @@
-"""Simulation of one scene in PyBullet, with bodies of a pool."""
+"""PyBullet: bodies of an asset library, and the simulation of one scene with them."""
 
 from __future__ import annotations
 
@@ -50,6 +50,12 @@ _SPARE_FACTOR = 3
 ``_SPARE_BODIES``: in every step Bullet compares the boxes of all bodies, including parked ones."""
 _ZERO = (0.0, 0.0, 0.0)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+_LOOK = 12
+"""Number of steps between checks for clusters at rest."""
+_USUAL_ITERATIONS = 35
+"""Solver iterations of a step that costs one unit of work per free object."""
+_STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
+"""An object is at rest when its present speed would take it less far than this (m, rad) in the whole duration."""
 
 
 class BodyPool:
@@ -75,14 +81,10 @@ class BodyPool:
         self._library = library
         self._bodies: dict[BodyKey, list[int]] = {}
         self._parking: dict[int, tuple[float, float, float]] = {}
-        self._frames: dict[int, tuple[Array, Array]] = {}  # category -> principal moments, axes
         self._wavefronts: dict[BodyKey, str] = {}
-
-    def principal(self, category: int) -> tuple[Array, Array]:
-        """Principal moments (3,) kg m^2 and axes (3, 3, columns) of an asset's inertia."""
-        if category not in self._frames:
-            self._frames[category] = principal_inertia(self._library.assets[category].asset.inertia)
-        return self._frames[category]
+        principal = [principal_inertia(asset.asset.inertia) for asset in library.assets]
+        self._moments = np.array([moments for moments, _ in principal])  # (C, 3) kg m^2
+        self.axes = np.array([axes for _, axes in principal])  # (C, 3, 3) principal axes of each asset, columns
 
     def take(self, needed: Mapping[BodyKey, int]) -> dict[BodyKey, list[int]]:
         """The first ``needed[key]`` parked bodies of each key, independently of earlier calls.
@@ -105,9 +107,7 @@ class BodyPool:
         bullet.resetBaseVelocity(body, _ZERO, _ZERO, physicsClientId=client)
         bullet.setCollisionFilterGroupMask(body, -1, 1, 1, physicsClientId=client)
 
-    def wake(
-        self, body: int, category: int, quaternion: Sequence[float], *, fixed: bool, damping: tuple[float, float]
-    ) -> None:
+    def wake(self, body: int, category: int, quaternion: Sequence[float], *, fixed: bool, damping: float) -> None:
         """Turn a parked body to its orientation and give it the dynamics of the coming simulation."""
         bullet, client = self.bullet, self.client
         bullet.resetBasePositionAndOrientation(body, self._parking[body], quaternion, physicsClientId=client)
@@ -119,8 +119,8 @@ class BodyPool:
             -1,
             mass=0.0 if fixed else float(self._library.assets[category].asset.mass),
             localInertiaDiagonal=_ZERO if fixed else self._inertia(category),
-            linearDamping=damping[0],
-            angularDamping=damping[1],
+            linearDamping=damping,
+            angularDamping=damping,
             activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
             physicsClientId=client,
         )
@@ -136,12 +136,6 @@ class BodyPool:
     def clear(self) -> None:
         """Drop all bodies; the next :meth:`take` builds those that it needs."""
         self._bodies = {}
-
-    def close(self) -> None:
-        """Disconnect from PyBullet."""
-        if self.client >= 0:
-            self.bullet.disconnect(self.client)
-            self.client = -1
 
     def _build(self, sizes: Mapping[BodyKey, int]) -> None:
         bullet, client = self.bullet, self.client
@@ -177,7 +171,7 @@ class BodyPool:
         category, level = key
         if key not in self._wavefronts:
             geometry: LevelGeometry = getattr(self._library.assets[category], level)
-            axes, center = self.principal(category)[1], self._library.center_of_mass[category]
+            axes, center = self.axes[category], self._library.center_of_mass[category]
             self._wavefronts[key] = _wavefront(
                 [SCALE * (inset_hull(part, MARGIN) - center) @ axes for part in geometry.parts]
             )
@@ -192,7 +186,7 @@ class BodyPool:
         return shape
 
     def _inertia(self, category: int) -> list[float]:
-        return (SCALE**2 * self.principal(category)[0]).tolist()  # type: ignore[no-any-return]
+        return (SCALE**2 * self._moments[category]).tolist()  # type: ignore[no-any-return]
 
     def _body(self, category: int, shape: int, visual: int, place: tuple[float, float, float]) -> int:
         static = bool(self._library.static[category])
@@ -224,22 +218,13 @@ def _wavefront(hulls: list[Array]) -> str:
     return "\n".join(lines) + "\n"
 
 
-_LOOK = 12
-"""Number of steps between checks for clusters at rest."""
-_USUAL_ITERATIONS = 35
-"""Solver iterations of a step that costs one unit of work per free object."""
-_STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
-"""An object is at rest when its present speed would take it less far than this (m, rad) in the whole duration."""
-
-
 @dataclass(frozen=True)
 class SolverSettings:
     """Settings of the integration of motion."""
 
-    time_step: float = 1.0 / 240.0  # length of a step, s
-    iterations: int = 50  # iterations of the sequential-impulse solver per step
-    linear_damping: float = 0.0  # fraction of velocity lost per second
-    angular_damping: float = 0.0  # fraction of angular velocity lost per second
+    time_step: float  # length of a step, s
+    iterations: int  # iterations of the sequential-impulse solver per step
+    damping: float = 0.0  # fraction of velocity and of angular velocity lost per second
     tilt: tuple[float, float] = (0.0, 0.0)  # (x, y) angles by which gravity is tilted toward the x and the y axis, rad
 
 
@@ -261,15 +246,10 @@ class World:
     def simulate(
         self, objects: Objects, fine: Mask, group: Index, duration: float, settings: SolverSettings, budget: Budget
     ) -> tuple[Array, Array, Array, Mask]:
-        """Move the objects of one scene for ``duration`` seconds under gravity.
+        """Move the objects (n,) of one scene for ``duration`` seconds under gravity.
 
-        Args:
-            objects: The n objects.
-            fine: (n,) bool; True for objects that collide with their fine parts.
-            group: (n,) number of the cluster of each free object; a cluster leaves the simulation when it is at rest.
-            duration: Simulated time, s.
-            settings: Settings of the integration.
-            budget: Units of simulation; when they are spent, all objects stay at the poses reached.
+        Objects that are ``fine`` (n,) collide with their fine parts. A cluster of free objects, those of one number in
+        ``group`` (n,), leaves the simulation when it is at rest. When ``budget`` is spent, all stay where they are.
 
         Returns:
             rotation (n, 3, 3) and translation (n, 3) m afterwards, the angle turned (n,) in radians, and the objects
@@ -288,16 +268,15 @@ class World:
     ) -> tuple[Array, Array, Array, Mask]:
         bullet, client = self._pool.bullet, self._pool.client
         category, fixed, count = objects.category, objects.fixed, len(objects)
-        axes = np.array([self._pool.principal(c)[1] for c in category.tolist()])
+        axes = self._pool.axes[category]
         center = self._library.center_of_mass[category]
         start_quaternion = quaternions(times(objects.rotation, axes))
         start_position = SCALE * (objects.translation + apply(objects.rotation, center))
 
         bodies, order = self._bodies(objects, fine)
-        damping = settings.linear_damping, settings.angular_damping
         for row in order:
-            turn = start_quaternion[row].tolist()
-            self._pool.wake(int(bodies[row]), int(category[row]), turn, fixed=bool(fixed[row]), damping=damping)
+            place = int(bodies[row]), int(category[row]), start_quaternion[row].tolist()
+            self._pool.wake(*place, fixed=bool(fixed[row]), damping=settings.damping)
         # After waking: Bullet sets the gravity of active bodies only.
         down = SCALE * GRAVITY * np.array([*np.sin(settings.tilt), -np.cos(np.hypot(*settings.tilt))])
         bullet.setGravity(*down.tolist(), physicsClientId=client)
@@ -319,7 +298,7 @@ class World:
             for _ in range(ahead if running else ahead % 2):  # the number of all steps is always even
                 bullet.stepSimulation(physicsClientId=client)
             done += ahead
-            budget.spend(ahead * sum(map(len, running.values())) * settings.iterations / _USUAL_ITERATIONS)
+            budget.spent += ahead * sum(map(len, running.values())) * settings.iterations / _USUAL_ITERATIONS
             leaving = np.zeros(count, dtype=bool)
             for label, rows in list(running.items()):
                 if done < steps and (budget.is_spent or self._is_still(bodies[rows], duration)):
@@ -336,10 +315,6 @@ class World:
         if not (np.isfinite(end_position).all() and np.isfinite(end_quaternion).all()):
             self._pool.clear()
         return new_rotation, new_translation, angle, left
-
-    def close(self) -> None:
-        """Disconnect from PyBullet."""
-        self._pool.close()
 
     def _bodies(self, objects: Objects, fine: Mask) -> tuple[Index, Index]:
         """A body (n,) for each object, and the order (n,) in which to treat them."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -25,6 +25,14 @@ _BLOCK = 1 << 15
 """Elements of the arrays that hold face-corner or edge-edge combinations at a time (they stay in the cache)."""
 _ROUNDING = 1e-13
 """Sine of an angle, or length (m), that may be a rounding error."""
+TOUCHING = 2e-5
+"""Overlap (m) below which the face-plane bound is taken as the depth, and no exact depth is computed."""
+NEAR = 3e-3
+"""Object pairs are listed when their boxes are at most this far apart (m)."""
+NEAR_FIXED = 0.06
+"""The same limit in height (m) where one of the two is fixed: the fall of an object onto it has a closed form."""
+_TOO_MANY = 20_000_000
+"""Limit of corner tests in the overlapping object pairs of one scene; above it, depths are upper bounds."""
 
 
 class PenetrationDepth:
@@ -158,11 +166,8 @@ class _Ragged:
 class _Halves:
     """Pairs seen from both sides: half ``2 p`` belongs to the first part of pair ``p``, half ``2 p + 1`` to the second.
 
-    Attributes:
-        owner: (2 P,) part whose features are tested.
-        other: (2 P,) the other part.
-        turn: (3, 3, 2 P) rotation from the owner's frame to the other's.
-        move: (3, 2 P) origin of the owner in the other's frame, m.
+    Of each half, ``owner`` (2 P,) is the part whose features are tested, ``other`` (2 P,) the other one. ``turn``
+    (3, 3, 2 P) and ``move`` (3, 2 P) m lead from the frame of the owner to that of the other.
     """
 
     def __init__(self, placed: PlacedParts, first: Index, second: Index) -> None:
@@ -177,12 +182,9 @@ class _Halves:
 
 
 class _Faces:
-    """The faces of the owners of half pairs, and the deepest corner of the other part under each face.
+    """The faces of the owners of half pairs, from ``start`` (2 P,) of each half on, with their ``normal`` (n,) index.
 
-    Attributes:
-        start: (2 P,) first face of each half pair.
-        normal: (n,) index of the face's normal in the library.
-        support: (n,) number of the deepest corner within its part.
+    ``support`` (n,) is the number of the deepest corner of the other part under each face.
     """
 
     def __init__(self, depths: PenetrationDepth, halves: _Halves) -> None:
@@ -300,16 +302,6 @@ def _blocks(work: Index, limit: int) -> Iterator[slice]:
         start = end
 
 
-TOUCHING = 2e-5
-"""Overlap (m) below which the face-plane bound is taken as the depth, and no exact depth is computed."""
-NEAR = 3e-3
-"""Object pairs are listed when their boxes are at most this far apart (m)."""
-NEAR_FIXED = 0.06
-"""The same limit in height (m) where one of the two is fixed: the fall of an object onto it has a closed form."""
-_TOO_MANY = 20_000_000
-"""Limit of corner tests in the overlapping object pairs of one scene; above it, depths are upper bounds."""
-
-
 class Collider:
     """Search for near and overlapping objects; geometry is built once, poses are arguments."""
 
@@ -324,9 +316,14 @@ class Collider:
         """
         coarse = place(self.library, objects, "coarse")
         low, high = object_boxes(coarse)
-        first, second = _near_pairs(objects, low, high)
-        contacts, gap, direction, keep = self._coarse_gaps(objects, coarse, first, second)
-        first, second, gap, direction = first[keep], second[keep], gap[keep], direction[keep]
+        first, second = scene_pairs(objects)
+        near = _boxes_near(low, high, first, second, NEAR, objects.fixed[first] | objects.fixed[second])
+        first, second = first[near], second[near]
+        contacts, pair = self._near_parts(objects, coarse, first, second, *part_pairs(coarse, first, second))
+        order = np.lexsort((contacts.gap, pair))
+        keep, leading = np.unique(pair[order], return_index=True)
+        best = order[leading]  # the contact with the smallest gap of each pair
+        first, second, gap, direction = first[keep], second[keep], contacts.gap[best], contacts.direction[best]
         depth, total = np.zeros(len(first)), np.zeros(len(first))
         part_count = np.zeros(len(first), dtype=np.int64)
         overlapping = np.flatnonzero(gap < 0)
@@ -337,7 +334,8 @@ class Collider:
             rough[overlapping] = tests[objects.scene[a]] > _TOO_MANY
             depth[rough] = -gap[rough]
             exact = overlapping[~rough[overlapping]]
-            self._fine_depths(objects, first, second, exact, gap, depth, total, part_count, totals)
+            found = self._fine_depths(objects, first[exact], second[exact], gap[exact], totals)
+            depth[exact], total[exact], part_count[exact] = found
         return ObjectPairs(first, second, gap, direction, depth, total, part_count, low, high, contacts, rough)
 
     def contacts(self, objects: Objects, pairs: ObjectPairs, fine: Mask) -> Contacts:
@@ -363,43 +361,22 @@ class Collider:
         part = placed.parts.part
         return Contacts(first[pair], second[pair], part[a], part[b], gap, direction), pair
 
-    def _coarse_gaps(
-        self, objects: Objects, coarse: PlacedObjects, first: Index, second: Index
-    ) -> tuple[Contacts, Array, Array, Index]:
-        pair, a, b = part_pairs(coarse, first, second)
-        contacts, pair = self._near_parts(objects, coarse, first, second, pair, a, b)
-        gap = np.full(len(first), np.inf)
-        direction = np.zeros((len(first), 3))
-        order = np.lexsort((contacts.gap, pair))
-        keep, leading = np.unique(pair[order], return_index=True)
-        best = order[leading]
-        gap[keep], direction[keep] = contacts.gap[best], contacts.direction[best]
-        return contacts, gap, direction, keep
-
     def _fine_depths(
-        self,
-        objects: Objects,
-        first: Index,
-        second: Index,
-        overlapping: Index,
-        gap: Array,
-        depth: Array,
-        total: Array,
-        part_count: Index,
-        totals: bool,
-    ) -> None:
+        self, objects: Objects, first: Index, second: Index, gap: Array, totals: bool
+    ) -> tuple[Array, Array, Index]:
+        """Depth (P,) m of each object pair, sum of the depths of its part pairs (P,) m, and their number (P,)."""
+        depth, total, part_count = np.zeros(len(gap)), np.zeros(len(gap)), np.zeros(len(gap), dtype=np.int64)
         # The depth of objects that barely touch is the bound from the face planes of the enclosing coarse parts.
         # Sums over part pairs need the fine parts, unless each of the two objects has only one.
-        single = np.array([len(asset.fine.parts) == 1 for asset in self.library.assets])
         simple = gap > -TOUCHING
         if totals:
+            single = np.array([len(asset.fine.parts) == 1 for asset in self.library.assets])
             simple &= single[objects.category[first]] & single[objects.category[second]]
-        settled = overlapping[simple[overlapping]]
-        depth[settled] = total[settled] = -gap[settled]
-        part_count[settled] = 1
-        hard = overlapping[~simple[overlapping]]
+        depth[simple] = total[simple] = -gap[simple]
+        part_count[simple] = 1
+        hard = np.flatnonzero(~simple)
         if not len(hard):
-            return
+            return depth, total, part_count
         used, local = np.unique(np.concatenate([first[hard], second[hard]]), return_inverse=True)
         fine = place(self.library, objects[used], "fine")
         pair, a, b = part_pairs(fine, local[: len(hard)], local[len(hard) :])
@@ -420,6 +397,7 @@ class Collider:
             np.maximum.at(depth, target[rows[meet]], value[meet])
             np.add.at(total, target[rows[meet]], value[meet])
             np.add.at(part_count, target[rows[meet]], 1)
+        return depth, total, part_count
 
 
 def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, second: Index) -> Array:
@@ -429,13 +407,10 @@ def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, secon
 
 
 def _rounds(target: Index, bound: Array, depth: Array, every: bool) -> Iterator[Index]:
-    """Rows of candidates that can still deepen their object pair; twice as many per pair in each round.
+    """Rows of candidates that can still deepen their object pair; twice as many per pair in each round, or all at once.
 
-    Args:
-        target: (Q,) object pair of each candidate, those of one pair together.
-        bound: (Q,) m, upper bound of each candidate's depth; descending within a pair.
-        depth: (P,) m, depths found so far; the caller updates them between rounds.
-        every: Whether to give all candidates at once.
+    The candidates of an object pair ``target`` (Q,) stand together, and the upper bounds ``bound`` (Q,) m of their
+    depths descend. The caller updates ``depth`` (P,) m, the depths found so far, between rounds.
     """
     rows = np.arange(len(target))
     if every:
@@ -459,10 +434,7 @@ def _boxes_near(low: Array, high: Array, a: Index, b: Index, margin: float, fixe
     return near
 
 
-@lru_cache(maxsize=512)
-def _upper_triangle(count: int) -> tuple[Index, Index]:
-    first, second = np.triu_indices(count, k=1)
-    return first.astype(np.int64), second.astype(np.int64)
+_upper_triangle = lru_cache(maxsize=512)(partial(np.triu_indices, k=1))
 
 
 def scene_pairs(objects: Objects) -> tuple[Index, Index]:
@@ -475,9 +447,3 @@ def scene_pairs(objects: Objects) -> tuple[Index, Index]:
     second = np.concatenate([t[1] + start for t, start in zip(triangles, starts, strict=True)])
     free = ~(objects.fixed[first] & objects.fixed[second])
     return first[free], second[free]
-
-
-def _near_pairs(objects: Objects, low: Array, high: Array) -> tuple[Index, Index]:
-    first, second = scene_pairs(objects)
-    near = _boxes_near(low, high, first, second, NEAR, objects.fixed[first] | objects.fixed[second])
-    return first[near], second[near]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 import torch
@@ -146,25 +147,22 @@ class _Hand:
             return free
         owner, rotation, low, high = self._extents(objects, free, back / np.linalg.norm(back))
         open_rows = free
-        for place_along in PLACES:
-            for reach in self.gripper.reaches:
-                if budget.is_spent:
-                    return free[:0]
-                tried = np.flatnonzero(np.isin(owner, open_rows))
-                across = low[tried, 0] + place_along * (high[tried, 0] - low[tried, 0])
-                deep = np.maximum(high[tried, 2] - reach, low[tried, 2])
-                tips = np.stack([across, 0.5 * (low[tried, 1] + high[tried, 1]), deep], axis=1)
-                tips = np.einsum("gij,gj->gi", rotation[tried], tips)
-                good = self._succeed(objects, owner[tried], rotation[tried], tips, budget)
-                open_rows = np.setdiff1d(open_rows, owner[tried[good]])
+        for place_along, reach in product(PLACES, self.gripper.reaches):
+            if budget.is_spent:
+                return free[:0]
+            tried = np.flatnonzero(np.isin(owner, open_rows))
+            across = low[tried, 0] + place_along * (high[tried, 0] - low[tried, 0])
+            deep = np.maximum(high[tried, 2] - reach, low[tried, 2])
+            tips = np.stack([across, 0.5 * (low[tried, 1] + high[tried, 1]), deep], axis=1)
+            tips = np.einsum("gij,gj->gi", rotation[tried], tips)
+            good = self._succeed(objects, owner[tried], rotation[tried], tips, budget)
+            open_rows = np.setdiff1d(open_rows, owner[tried[good]])
         return np.setdiff1d(free, open_rows)
 
     def _extents(self, objects: Objects, rows: Index, back: Array) -> tuple[Index, Array, Array, Array]:
-        """Gripper frames for some objects, and the extents of the objects along the axes of these frames.
+        """Gripper frames for some objects: owner (G,), rotation (G, 3, 3) to the world, and the owner's extents in it.
 
-        Returns:
-            owner (G,), rotation (G, 3, 3) gripper to world, lowest and highest coordinate (G, 3), (G, 3) m along the
-            axes of the gripper.
+        The extents are the lowest and highest coordinates (G, 3), (G, 3) m along the axes of the gripper.
         """
         rotation = _frames(objects.rotation[rows], back)  # (n, T, 3, 3)
         low, high = np.empty(rotation.shape[:3]), np.empty(rotation.shape[:3])
@@ -202,7 +200,7 @@ class _Hand:
         near = ((placed.low[a] < placed.high[b]) & (placed.low[b] < placed.high[a])).all(axis=-1)
         pair, a, b = pair[near], a[near], b[near]
         overlap = np.zeros(len(first), dtype=bool)
-        budget.spend(len(pair))
+        budget.spent += len(pair)
         if budget.is_spent:
             return overlap
         gap, _ = separations(self.collider.library, placed.parts, a, b)
@@ -235,15 +233,8 @@ def _frames(rotation: Array, back: Array) -> Array:
 
 def _concatenate(objects: Objects, category: int, rotation: Array, translation: Array) -> Objects:
     """The objects of one scene, followed by G tools."""
-    count = len(rotation)
-    return Objects(
-        np.concatenate([objects.scene, np.zeros(count, dtype=np.int64)]),
-        np.concatenate([objects.slot, np.full(count, -1)]),
-        np.concatenate([objects.category, np.full(count, category)]),
-        np.concatenate([objects.rotation, rotation.reshape(-1, 3, 3)]),
-        np.concatenate([objects.translation, translation.reshape(-1, 3)]),
-        np.concatenate([objects.fixed, np.zeros(count, dtype=bool)]),
-    )
+    scene = np.zeros(len(rotation), dtype=np.int64)
+    return objects + Objects(scene, scene - 1, scene + category, rotation, translation, scene > 0)
 
 
 def _tool(name: str, parts: tuple[ConvexPart, ...]) -> Asset:

@@ -34,14 +34,9 @@ class Chunk:
     def __len__(self) -> int:
         return len(self.categories)
 
-    def row(self, index: int) -> Chunk:
-        """One scene as a chunk."""
-        rows = slice(index, index + 1)
+    def __getitem__(self, rows: slice) -> Chunk:
         units = None if self.units is None else self.units[rows]
         return Chunk(self.scene_type, self.translations[rows], self.rotations[rows], self.categories[rows], units)
-
-
-Kernel = Callable[..., dict[str, Any]]
 
 
 def _is_heap(physics: Physics, objects: Objects) -> bool:
@@ -52,9 +47,12 @@ def _is_heap(physics: Physics, objects: Objects) -> bool:
     return True
 
 
-def _objects(physics: Physics, chunk: Chunk) -> Objects:
+def _start(chunk: Chunk) -> tuple[Physics, Objects, NDArray[np.bool_]]:
+    """Physics and objects of a chunk, and the validity (b,) of its scenes: so far, all are valid."""
+    physics = physics_of(chunk.scene_type)
     welded = np.isin(chunk.categories, np.array(chunk.scene_type.welded_categories, dtype=np.int64))
-    return flatten(physics.library, chunk.translations, chunk.rotations, chunk.categories, welded)
+    objects = flatten(physics.library, chunk.translations, chunk.rotations, chunk.categories, welded)
+    return physics, objects, np.ones(len(chunk), dtype=bool)
 
 
 def _budgets(chunk: Chunk, objects: Objects, pairs: ObjectPairs) -> list[Budget]:
@@ -75,8 +73,7 @@ def feasibility_kernel(
     tilt: tuple[float, float] = (0.0, 0.0),
 ) -> dict[str, Any]:
     """See :func:`scene_envs.physics.feasibility`; gravity is tilted by ``tilt`` (rad) toward the x and the y axis."""
-    physics = physics_of(chunk.scene_type)
-    objects = _objects(physics, chunk)
+    physics, objects, valid = _start(chunk)
     pairs = physics.collider.pairs(objects)
     depth = pairs.deepest()
     deep = depth > max_penetration
@@ -87,7 +84,6 @@ def feasibility_kernel(
         physics, objects[kept], pairs.among(kept), duration, budgets, tilt
     )
     feasible = ~objects.fixed & ~deep & (displacement <= max_displacement) & (rotation <= max_rotation)
-    valid = np.ones(len(chunk), dtype=bool)
     valid[lost] = False
     return {
         "feasible": _scatter(chunk, objects, feasible),
@@ -101,15 +97,11 @@ def feasibility_kernel(
 
 def equilibrium_kernel(chunk: Chunk, *, duration: float) -> dict[str, Any]:
     """See :func:`scene_envs.physics.equilibrium`."""
-    physics = physics_of(chunk.scene_type)
-    objects = _objects(physics, chunk)
-    invalid = [index for index in range(len(chunk)) if _is_heap(physics, objects[objects.scene == index])]
-    kept = np.flatnonzero(~np.isin(objects.scene, invalid))
-    objects = objects[kept]
+    physics, objects, valid = _start(chunk)
+    valid[:] = [not _is_heap(physics, objects[objects.scene == index]) for index in range(len(chunk))]
+    objects = objects[valid[objects.scene]]
     pairs = physics.collider.pairs(objects)
     displacement, rotation, lost = motion(physics, objects, pairs, duration, _budgets(chunk, objects, pairs))
-    valid = np.ones(len(chunk), dtype=bool)
-    valid[invalid] = False
     valid[lost] = False
     return {
         "displacement": _scatter(chunk, objects, displacement),
@@ -120,14 +112,11 @@ def equilibrium_kernel(chunk: Chunk, *, duration: float) -> dict[str, Any]:
 
 def penetration_kernel(chunk: Chunk) -> dict[str, Any]:
     """See :func:`scene_envs.physics.penetration`."""
-    physics = physics_of(chunk.scene_type)
-    objects = _objects(physics, chunk)
+    physics, objects, valid = _start(chunk)
     pairs = physics.collider.pairs(objects, totals=True)
-    valid = np.ones(len(chunk), dtype=bool)
     valid[objects.scene[pairs.first[pairs.rough]]] = False
     if not valid.all():
         _LOGGER.warning("objects of a scene overlap too much to be measured one by one; its row is invalid")
-    depth = pairs.deepest()
     listed: list[list[tuple[int, int, float, float, int]]] = [[] for _ in range(len(chunk))]
     for row in np.flatnonzero(pairs.depth > 0):
         a, b = pairs.first[row], pairs.second[row]
@@ -135,7 +124,7 @@ def penetration_kernel(chunk: Chunk) -> dict[str, Any]:
         listed[objects.scene[a]].append((*entry, int(pairs.part_count[row])))
     return {
         "pairs": listed,
-        "depth": _scatter(chunk, objects, depth),
+        "depth": _scatter(chunk, objects, pairs.deepest()),
         "total_per_pair": np.array([sum(entry[2] for entry in scene) for scene in listed]),
         "total_per_geometry": np.array([sum(entry[3] for entry in scene) for scene in listed]),
         "valid": valid,
@@ -144,26 +133,23 @@ def penetration_kernel(chunk: Chunk) -> dict[str, Any]:
 
 def furniture_kernel(chunk: Chunk) -> dict[str, Any]:
     """See :func:`scene_envs.physics.furniture_overlap`."""
-    physics = physics_of(chunk.scene_type)
-    objects = _objects(physics, chunk)
+    physics, objects, valid = _start(chunk)
     categories = chunk.scene_type.welded_categories, chunk.scene_type.furniture_categories
     is_welded, is_furniture = (np.isin(objects.category, np.array(some, dtype=np.int64)) for some in categories)
     welded, furniture = objects[is_welded], is_furniture[is_welded]
     pairs = physics.collider.pairs(replace(welded, fixed=~furniture))  # the collider skips pairs of fixed objects
     depth = np.where(furniture, pairs.deepest(), 0.0)
-    return {"depth": _scatter(chunk, welded, depth), "valid": np.ones(len(chunk), dtype=bool)}
+    return {"depth": _scatter(chunk, welded, depth), "valid": valid}
 
 
 def settle_kernel(chunk: Chunk, *, duration: float, iterations: int) -> dict[str, Any]:
     """See :func:`scene_envs.physics.settle`."""
-    physics = physics_of(chunk.scene_type)
-    translations, rotations = chunk.translations.copy(), chunk.rotations.copy()
-    valid = np.ones(len(chunk), dtype=bool)
+    translations, rotations, valid = chunk.translations.copy(), chunk.rotations.copy(), np.ones(len(chunk), dtype=bool)
     finished, spent = np.ones(len(chunk), dtype=bool), np.zeros(len(chunk))
     bottom = chunk.scene_type.workspace[0][2] - _FALLEN
     for index in range(len(chunk)):
-        row = chunk.row(index)
-        objects = _objects(physics, row)
+        row = chunk[index : index + 1]
+        physics, objects, _ = _start(row)
         valid[index] = not _is_heap(physics, objects)
         if not valid[index]:
             continue
@@ -187,11 +173,10 @@ def settle_kernel(chunk: Chunk, *, duration: float, iterations: int) -> dict[str
 
 def projection_kernel(chunk: Chunk) -> dict[str, Any]:
     """See :func:`scene_envs.physics.project`."""
-    physics = physics_of(chunk.scene_type)
     translations = chunk.translations.copy()
     residual, heap = np.zeros(len(chunk)), np.zeros(len(chunk), dtype=bool)
     for index in range(len(chunk)):
-        objects = _objects(physics, chunk.row(index))
+        physics, objects, _ = _start(chunk[index : index + 1])
         result = project_objects(physics.collider, objects, chunk.scene_type.workspace)
         translations[index, objects.slot] = result.translation
         residual[index], heap[index] = result.residual_depth, result.heap
@@ -206,10 +191,9 @@ def projection_kernel(chunk: Chunk) -> dict[str, Any]:
 
 def units_kernel(chunk: Chunk) -> dict[str, Any]:
     """Units of simulation that each scene may spend; 0 for heaps, which are not simulated."""
-    physics = physics_of(chunk.scene_type)
     units = np.zeros(len(chunk))
     for index in range(len(chunk)):
-        objects = _objects(physics, chunk.row(index))
+        physics, objects, _ = _start(chunk[index : index + 1])
         if not heaps(physics.collider, objects).any():
             units[index] = simulation_units(objects, physics.collider.pairs(objects))
     return {"units": units, "valid": np.ones(len(chunk), dtype=bool)}
@@ -222,7 +206,7 @@ def _scatter(chunk: Chunk, objects: Objects, values: NDArray[Any]) -> NDArray[An
     return out
 
 
-KERNELS: dict[str, Kernel] = {
+KERNELS: dict[str, Callable[..., dict[str, Any]]] = {
     "feasibility": feasibility_kernel,
     "equilibrium": equilibrium_kernel,
     "penetration": penetration_kernel,

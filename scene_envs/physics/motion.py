@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -36,6 +36,10 @@ _LONG, _CREEP = 1.0, 1e-2
 again with ``CONVERGED`` iterations."""
 _DAMPING = 0.3
 """Fraction of velocity that objects lose per second while they settle."""
+_SEGMENT = 0.25
+"""Length (s) of a segment; after each, settling chooses the shapes again and checks whether anything still moves."""
+_STILL, _STILL_ANGLE = 5e-5, 5e-4
+"""An object that moved less than this (m, rad) in a segment has come to rest."""
 
 
 class Physics:
@@ -46,19 +50,16 @@ class Physics:
         self.collider = Collider(library)
         self.support = Support(library)
         self.statics = Statics(library)
-        self._world: World | None = None
 
     def rest(self, objects: Objects, pairs: ObjectPairs, duration: float) -> Rest:
         """Objects of some scenes that need no simulation for ``duration`` seconds."""
         contacts = self.collider.contacts(objects, pairs, self.support.differs(objects, pairs))
         return self.statics.at_rest(objects, pairs, contacts, duration)
 
-    @property
+    @cached_property
     def world(self) -> World:
         """The PyBullet world, made on first use; MissingDependencyError without PyBullet."""
-        if self._world is None:
-            self._world = World(self.library)
-        return self._world
+        return World(self.library)
 
 
 _physics = cache(Physics)
@@ -91,18 +92,10 @@ def motion(
     budgets: Sequence[Budget],
     tilt: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Array, Array, Index]:
-    """Displacement of the objects of several scenes in ``duration`` seconds.
+    """Displacement (n,) m and rotation (n,) rad of the objects of several scenes in ``duration`` seconds.
 
-    Args:
-        physics: Physics of the scenes' assets.
-        objects: Objects of the scenes.
-        pairs: Near pairs of the objects.
-        duration: Simulated time, s.
-        budgets: Units of simulation that each scene may spend.
-        tilt: (x, y) angles by which gravity is tilted in simulations, rad.
-
-    Returns:
-        displacement (n,) m, rotation (n,) rad, and the scenes whose simulation diverged or was too much work.
+    Also returns the scenes whose simulation diverged or was too much work: ``budgets`` hold the units that each may
+    spend. ``tilt`` is the (x, y) angles (rad) by which gravity is tilted in simulations.
     """
     rest = physics.rest(objects, pairs, duration)
     displacement, rotation = np.abs(rest.rise), rest.tilt.copy()
@@ -137,16 +130,9 @@ def advance(
     simulated object reaches an object that was not simulated, or that had come to rest and left the simulation, the two
     are simulated again together.
 
-    Args:
-        physics: Physics of the scene's assets.
-        objects: Objects of one scene.
-        pairs: Near pairs of the objects.
-        rest: Objects with a closed form, and their motion.
-        duration: Simulated time, s.
-        budget: Units of simulation; when they are spent, objects stay at the poses reached.
-        settling: Solver iterations per step of a damped motion. None simulates undamped, and doubtful motion again with
-            other settings.
-        tilt: (x, y) angles by which gravity is tilted in simulations, rad.
+    When ``budget`` is spent, objects stay at the poses reached. ``settling`` is the number of solver iterations per
+    step of a damped motion; None simulates undamped, and doubtful motion again with other settings. ``tilt`` is the
+    (x, y) angles (rad) by which gravity is tilted in simulations.
     """
     translation = objects.translation.copy()
     translation[:, 2] += rest.rise
@@ -163,7 +149,13 @@ def advance(
         hits = _meetings(physics, objects, pairs, due, group, left, moved)
         if hits is None:
             break
-        due = _merge(objects, pairs, group, *hits)
+        touched = np.zeros(len(objects), dtype=bool)
+        touched[np.concatenate(hits)] = True
+        touched |= np.isin(group, group[touched & (group >= 0)])
+        due = company(objects, pairs, touched)
+        due |= np.isin(group, group[due & (group >= 0)])
+        # one cluster for all of these few objects; those that were at rest are at rest again
+        group[due] = int(group.max()) + 1
     return moved
 
 
@@ -193,7 +185,7 @@ def _simulate(
         if budget.is_spent:
             return
         if settling is not None:
-            settings = SolverSettings(settings.time_step, settling, _DAMPING, _DAMPING)
+            settings = SolverSettings(settings.time_step, settling, _DAMPING)
         settings = replace(settings, tilt=tilt)
         rows = np.flatnonzero(objects.fixed | members)
         end = physics.world.simulate(objects[rows], fine[rows], group[rows], duration, settings, budget)
@@ -242,28 +234,9 @@ def _meetings(
     return first, second
 
 
-def _merge(objects: Objects, pairs: ObjectPairs, group: Index, first: Index, second: Index) -> Mask:
-    """Join the clusters of objects that met, in ``group`` in place; returns the objects to simulate again (n,)."""
-    count = len(objects)
-    touched = np.zeros(count, dtype=bool)
-    touched[first] = touched[second] = True
-    touched |= np.isin(group, group[touched & (group >= 0)])
-    due = company(objects, pairs, touched)
-    due |= np.isin(group, group[due & (group >= 0)])
-    # one cluster for all of these few objects; those that were at rest are at rest again
-    group[due] = int(group.max()) + 1
-    return due
-
-
 def settings_for(height: int) -> SolverSettings:
     """Solver settings of a stack whose topmost object stands on ``height`` others: taller stacks get finer steps."""
     return FINEST if height >= _HIGH else SolverSettings(1.0 / 480.0, ITERATIONS)
-
-
-_SEGMENT = 0.25
-"""Length (s) of a segment; after each, settling chooses the shapes again and checks whether anything still moves."""
-_STILL, _STILL_ANGLE = 5e-5, 5e-4
-"""An object that moved less than this (m, rad) in a segment has come to rest."""
 
 
 def settle_scene(
@@ -277,14 +250,8 @@ def settle_scene(
 ) -> tuple[Array, Array, bool]:
     """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether they stayed finite.
 
-    Args:
-        physics: Physics of the scene's assets.
-        objects: Objects of one scene.
-        pairs: Near pairs of the objects.
-        duration: Longest time to simulate, s.
-        iterations: Solver iterations per step.
-        bottom: Height (m) below which objects are simulated no further.
-        budget: Units of simulation; when they are spent, objects stay at the poses reached.
+    The motion lasts at most ``duration`` seconds. Objects below the height ``bottom`` (m) are simulated no further, and
+    when ``budget`` is spent, all stay at the poses reached.
     """
     current = objects
     calm = np.zeros(len(objects), dtype=bool)  # was simulated, and did not move

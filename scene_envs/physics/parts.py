@@ -1,10 +1,10 @@
-"""One convex part of an asset with its face planes."""
+"""Collision geometry of assets: convex parts, their features, flat contact faces, and the tables of a library."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import cache, cached_property
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,6 +16,21 @@ from scene_envs.assets.base import Asset, ConvexPart
 
 SIZE_CLASSES = ((8, 6), (16, 16), (32, 24))
 """(corners, face directions) up to which parts share padded arrays; larger parts make a last class."""
+GRAVITY = 9.81
+"""m/s^2."""
+FRICTION = 0.6
+"""Coulomb friction coefficient between any two objects."""
+_FACE_TOLERANCE = 1e-5
+"""Corners this close (m) to the extreme height belong to the face."""
+_SAME_AREA = 1e-3
+"""Relative difference of areas below which a face has no hole."""
+_SAME_NORMAL = 1e-10
+"""Faces whose unit normals differ by less than this are one face."""
+_MIN_EXTENT = 1e-12
+"""Relative size below which a part is a point, width below which a flat part is a line, and height that counts as 0."""
+_CONTAINED = 1e-6
+"""A corner of a fine part up to this far (m) outside a coarse part still counts as inside."""
+Records = TypeVar("Records", bound="Rows")
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,25 +55,12 @@ class PartGeometry:
         normals = normals[kept] if kept else np.concatenate([np.eye(3), -np.eye(3)])
         return cls(part.vertices, normals, (normals @ part.vertices.T).max(axis=1))
 
-    @cached_property
+    @property
     def size_class(self) -> int:
-        """Index into the padded arrays that hold this part."""
-        for index, (corners, directions) in enumerate(SIZE_CLASSES):
-            if len(self.vertices) <= corners and len(self.normals) <= directions:
-                return index
-        return len(SIZE_CLASSES)
-
-
-GRAVITY = 9.81
-"""m/s^2."""
-FRICTION = 0.6
-"""Coulomb friction coefficient between any two objects."""
-
-
-_FACE_TOLERANCE = 1e-5
-"""Corners this close (m) to the extreme height belong to the face."""
-_SAME_AREA = 1e-3
-"""Relative difference of areas below which a face has no hole."""
+        """Index of the first of :data:`SIZE_CLASSES` that the part fits into, or their number."""
+        sizes = len(self.vertices), len(self.normals)
+        fits = (index for index, (v, k) in enumerate(SIZE_CLASSES) if sizes[0] <= v and sizes[1] <= k)
+        return next(fits, len(SIZE_CLASSES))
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,6 @@ class ContactFace:
     center: tuple[float, float]  # centre (x, y) in the asset frame, m
     inner: float  # radius (m) of the largest circle inside the outline
     corners: float  # smallest distance (m) of an outline corner from the centre
-    outer: float  # largest distance (m) of an outline corner from the centre
     hole: float  # radius (m) outside of which the face is solid up to its outline; 0 without a hole
 
 
@@ -100,9 +101,7 @@ def contact_face(fine: Sequence[PartGeometry], coarse: Sequence[PartGeometry], s
         if not len(inside):
             return None
         hole = float(np.linalg.norm(inside - center, axis=1).max())
-    return ContactFace(
-        height, (float(center[0]), float(center[1])), inner, float(radii.min()), float(radii.max()), hole
-    )
+    return ContactFace(height, (float(center[0]), float(center[1])), inner, float(radii.min()), hole)
 
 
 def _flat_corners(part: PartGeometry, height: float) -> Array | None:
@@ -128,12 +127,6 @@ def _outside(points: Array, polygon: Array) -> Array:
     edge = np.roll(polygon, -1, axis=0) - polygon
     normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     return ((points[:, None] - polygon[None]) * normal[None]).sum(axis=2).max(axis=1)
-
-
-_SAME_NORMAL = 1e-10
-"""Faces whose unit normals differ by less than this are one face."""
-_MIN_EXTENT = 1e-12
-"""Relative size below which a part is a point, width below which a flat part is a line, and height that counts as 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,10 +209,6 @@ def _distinct(normals: Array) -> tuple[Array, Index]:
     return exact[kept], number.ravel()[face]
 
 
-_CONTAINED = 1e-6
-"""A corner of a fine part up to this far (m) outside a coarse part still counts as inside."""
-
-
 @dataclass(frozen=True, eq=False)
 class LevelGeometry:
     """All parts of one asset at one level of detail."""
@@ -272,7 +261,9 @@ class LibraryGeometry:
         for index in np.unique(self.size_class).tolist():
             members = np.flatnonzero(self.size_class == index)
             self.row[members] = np.arange(len(members))
-            self.tables[index] = _table([self.parts[m] for m in members])
+            parts = [self.parts[m] for m in members]
+            columns = ([getattr(part, field.name) for part in parts] for field in fields(PartTable))
+            self.tables[index] = PartTable(*map(padded, columns))
 
     def _add(self, asset: Asset) -> AssetGeometry:
         fine = self._level(asset.fine)
@@ -293,27 +284,16 @@ class LibraryGeometry:
 
 def _encloses(coarse: LevelGeometry, fine: LevelGeometry) -> bool:
     """Whether every fine part lies inside one coarse part."""
-    for part in fine.parts:
-        if not any(
-            (outer.normals @ part.vertices.T <= outer.offsets[:, None] + _CONTAINED).all() for outer in coarse.parts
-        ):
-            return False
-    return True
+    return all(
+        any((outer.normals @ part.vertices.T <= outer.offsets[:, None] + _CONTAINED).all() for outer in coarse.parts)
+        for part in fine.parts
+    )
 
 
-def _table(parts: Sequence[PartGeometry]) -> PartTable:
-    corners = max(len(part.vertices) for part in parts)
-    directions = max(len(part.normals) for part in parts)
-    vertices = np.empty((len(parts), corners, 3))
-    normals = np.empty((len(parts), directions, 3))
-    offsets = np.empty((len(parts), directions))
-    for index, part in enumerate(parts):
-        vertices[index] = part.vertices[0]
-        vertices[index, : len(part.vertices)] = part.vertices
-        normals[index], offsets[index] = part.normals[0], part.offsets[0]
-        normals[index, : len(part.normals)] = part.normals
-        offsets[index, : len(part.offsets)] = part.offsets
-    return PartTable(vertices, normals, offsets)
+def padded(rows: Sequence[Array]) -> Array:
+    """Arrays (k, ...) of different lengths as one, padded with copies of the first entry of each."""
+    longest = max(map(len, rows))
+    return np.stack([np.concatenate([row, np.repeat(row[:1], longest - len(row), axis=0)]) for row in rows])
 
 
 def inset_hull(part: PartGeometry, distance: float) -> Array:
@@ -401,9 +381,6 @@ def principal_inertia(inertia: Array) -> tuple[Array, Array]:
     if np.linalg.det(axes) < 0:
         axes[:, 0] *= -1.0
     return moments, axes
-
-
-Records = TypeVar("Records", bound="Rows")
 
 
 class Rows:

@@ -1,4 +1,4 @@
-"""Objects of a chunk of scenes as flat arrays, and their convex parts in the world."""
+"""Objects of some scenes as flat arrays, their convex parts in the world, gaps between these, and budgets of work."""
 
 from __future__ import annotations
 
@@ -9,11 +9,25 @@ from typing import Literal
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.parts import SIZE_CLASSES, LevelGeometry, LibraryGeometry, Rows
+from scene_envs.physics.parts import SIZE_CLASSES, LevelGeometry, LibraryGeometry, PartTable, Rows
 
 _CLASSES = len(SIZE_CLASSES) + 1
 _BLOCK = 1 << 16
 """Face-corner combinations computed together: their arrays stay in the cache."""
+Level = Literal["fine", "coarse"]
+PER_SCENE, PER_OBJECT, PER_PAIR, MAX_PER_OBJECT = 1_000.0, 1_200.0, 500.0, 10_000.0
+"""Units of simulation (see :class:`Budget`) that a scene may take: ``PER_SCENE``, plus ``PER_OBJECT`` for each free
+object, plus ``PER_PAIR`` for each pair of free objects, because they may meet. The sum of the last two is at most
+``MAX_PER_OBJECT`` for each free object."""
+MIN_UNITS = 20_000.0
+"""Smallest number of units beyond ``PER_SCENE``, unless ``MAX_PER_OBJECT`` gives fewer. It lets a scene of five
+objects go through all rounds of :func:`~scene_envs.physics.make_ready`."""
+_CROWDED = 0.75
+"""Above this share of free objects that do not stand clear of each other, a scene gets only ``PER_SCENE`` units."""
+_COINCIDENT = 0.9
+"""Two objects coincide when the common part of their boxes is at least this share of the larger box."""
+_DEEP = 1e-2
+"""A free object does not stand clear when it is deeper than this (m) in another free one, or coincides with one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,39 +54,39 @@ def separations(library: LibraryGeometry, placed: PlacedParts, first: Index, sec
     """
     gap = np.empty(len(first))
     direction = np.empty((len(first), 3))
+    for rows, a, b in _groups(library, placed, first, second):
+        combinations = a.normals.shape[1] * b.vertices.shape[1] + b.normals.shape[1] * a.vertices.shape[1]
+        step = max(1, _BLOCK // combinations)
+        for start in range(0, len(rows), step):
+            some = rows[start : start + step]
+            one, two = first[some], second[some]
+            shift = placed.translation[two] - placed.translation[one]
+            gap_a, normal_a = _best_face_gap(*_faces_and_corners(library, placed, a, one, b, two), shift)
+            gap_b, normal_b = _best_face_gap(*_faces_and_corners(library, placed, b, two, a, one), -shift)
+            use_a = gap_a >= gap_b
+            gap[some] = np.where(use_a, gap_a, gap_b)
+            direction[some] = np.where(use_a[:, None], normal_a, -normal_b)
+    return gap, direction
+
+
+def _groups(
+    library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index
+) -> Iterator[tuple[Index, PartTable, PartTable]]:
+    """Rows of the pairs whose parts are in the same two tables, and these tables."""
     classes = library.size_class[placed.part]
     groups = classes[first] * _CLASSES + classes[second]
     for group in np.unique(groups):
         class_a, class_b = divmod(int(group), _CLASSES)
-        rows = np.flatnonzero(groups == group)
-        step = max(1, _BLOCK // _combinations(library, class_a, class_b))
-        for start in range(0, len(rows), step):
-            some = rows[start : start + step]
-            gap[some], direction[some] = _one_group(library, placed, first[some], second[some], class_a, class_b)
-    return gap, direction
+        yield np.flatnonzero(groups == group), library.tables[class_a], library.tables[class_b]
 
 
-def _combinations(library: LibraryGeometry, class_a: int, class_b: int) -> int:
-    """Faces of one part times corners of the other, both ways, for parts of two size classes."""
-    a, b = library.tables[class_a], library.tables[class_b]
-    return a.normals.shape[1] * b.vertices.shape[1] + b.normals.shape[1] * a.vertices.shape[1]
-
-
-def _one_group(
-    library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index, class_a: int, class_b: int
-) -> tuple[Array, Array]:
-    table_a, table_b = library.tables[class_a], library.tables[class_b]
-    row_a, row_b = library.row[placed.part[first]], library.row[placed.part[second]]
-    rotation_a, rotation_b = placed.rotation[first], placed.rotation[second]
-    shift = placed.translation[second] - placed.translation[first]  # (P, 3)
-    gap_a, normal_a = _face_gaps(
-        table_a.normals[row_a], table_a.offsets[row_a], rotation_a, table_b.vertices[row_b], rotation_b, shift
-    )
-    gap_b, normal_b = _face_gaps(
-        table_b.normals[row_b], table_b.offsets[row_b], rotation_b, table_a.vertices[row_a], rotation_a, -shift
-    )
-    use_a = gap_a >= gap_b
-    return np.where(use_a, gap_a, gap_b), np.where(use_a[:, None], normal_a, -normal_b)
+def _faces_and_corners(
+    library: LibraryGeometry, placed: PlacedParts, table: PartTable, owner: Index, other_table: PartTable, other: Index
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Face normals, face offsets and rotation of the owners; corners and rotation of the other parts."""
+    row, other_row = library.row[placed.part[owner]], library.row[placed.part[other]]
+    own = table.normals[row], table.offsets[row], placed.rotation[owner]
+    return *own, other_table.vertices[other_row], placed.rotation[other]
 
 
 def grouped_gaps(
@@ -85,24 +99,14 @@ def grouped_gaps(
     Yields:
         rows (Q,) of the pairs, gaps (Q, K) m, and directions (Q, K, 3) in the world, from first to second.
     """
-    classes = library.size_class[placed.part]
-    groups = classes[first] * _CLASSES + classes[second]
-    for group in np.unique(groups):
-        rows = np.flatnonzero(groups == group)
-        table_a, table_b = (library.tables[index] for index in divmod(int(group), _CLASSES))
-        a, b = first[rows], second[rows]
-        row_a, row_b = library.row[placed.part[a]], library.row[placed.part[b]]
-        turn_a, turn_b = placed.rotation[a], placed.rotation[b]
-        gap_a, normal_a = _all_face_gaps(
-            table_a.normals[row_a], table_a.offsets[row_a], turn_a, table_b.vertices[row_b], turn_b, shift[rows]
-        )
-        gap_b, normal_b = _all_face_gaps(
-            table_b.normals[row_b], table_b.offsets[row_b], turn_b, table_a.vertices[row_a], turn_a, -shift[rows]
-        )
+    for rows, a, b in _groups(library, placed, first, second):
+        one, two = first[rows], second[rows]
+        gap_a, normal_a = _face_gaps(*_faces_and_corners(library, placed, a, one, b, two), shift[rows])
+        gap_b, normal_b = _face_gaps(*_faces_and_corners(library, placed, b, two, a, one), -shift[rows])
         yield rows, np.concatenate([gap_a, gap_b], axis=1), np.concatenate([normal_a, -normal_b], axis=1)
 
 
-def _face_gaps(
+def _best_face_gap(
     normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
 ) -> tuple[Array, Array]:
     """Best face of the owner: (P,) gap and (P, 3) world normal; ``shift`` leads to the other part."""
@@ -115,7 +119,7 @@ def _face_gaps(
     return gaps[rows, best], rotate(rotation, normals[rows, best][:, None])[:, 0]
 
 
-def _all_face_gaps(
+def _face_gaps(
     normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
 ) -> tuple[Array, Array]:
     """Every face of the owner: (P, K) gaps and (P, K, 3) world normals."""
@@ -136,9 +140,6 @@ def _along(directions: Array, vector: Array) -> Array:
     """(P, K) m: components of vectors (P, 3) along directions (P, K, 3)."""
     x, y, z = vector[:, None, 0], vector[:, None, 1], vector[:, None, 2]
     return directions[..., 0] * x + directions[..., 1] * y + directions[..., 2] * z  # type: ignore[no-any-return]
-
-
-Level = Literal["fine", "coarse"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,21 +272,6 @@ class ObjectPairs:
         return depth
 
 
-PER_SCENE, PER_OBJECT, PER_PAIR, MAX_PER_OBJECT = 1_000.0, 1_200.0, 500.0, 10_000.0
-"""Units of simulation (see :class:`Budget`) that a scene may take: ``PER_SCENE``, plus ``PER_OBJECT`` for each free
-object, plus ``PER_PAIR`` for each pair of free objects, because they may meet. The sum of the last two is at most
-``MAX_PER_OBJECT`` for each free object."""
-MIN_UNITS = 20_000.0
-"""Smallest number of units beyond ``PER_SCENE``, unless ``MAX_PER_OBJECT`` gives fewer. It lets a scene of five
-objects go through all rounds of :func:`~scene_envs.physics.make_ready`."""
-_CROWDED = 0.75
-"""Above this share of free objects that do not stand clear of each other, a scene gets only ``PER_SCENE`` units."""
-_COINCIDENT = 0.9
-"""Two objects coincide when the common part of their boxes is at least this share of the larger box."""
-_DEEP = 1e-2
-"""A free object does not stand clear when it is deeper than this (m) in another free one, or coincides with one."""
-
-
 @dataclass
 class Budget:
     """Units of work that a search or a simulation may spend.
@@ -296,10 +282,6 @@ class Budget:
 
     limit: float  # number of units at which the work ends
     spent: float = 0.0  # number of units spent so far
-
-    def spend(self, units: float) -> None:
-        """Add ``units`` of work."""
-        self.spent += units
 
     @property
     def is_spent(self) -> bool:

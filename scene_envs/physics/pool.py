@@ -6,6 +6,7 @@ import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import accumulate
 from typing import Any
 
 from scene_envs.assets.base import Asset, AssetLibrary
@@ -62,24 +63,13 @@ class PhysicsPool(WorkerPool):
         self._scene_types: dict[tuple[SceneType, tuple[int, ...]], tuple[int, tuple[Asset, ...]]] = {}
 
     def run(self, kernel: str, chunks: Sequence[Chunk], options: Mapping[str, Any]) -> list[dict[str, Any] | None]:
-        """Run a kernel on every chunk.
+        """Run a kernel of ``scene_envs.physics.kernels.KERNELS`` with its options on chunks of one scene type.
 
-        Args:
-            kernel: name of a function of ``scene_envs.physics.kernels.KERNELS``.
-            chunks: scenes, all of one scene type.
-            options: keyword arguments of the kernel.
-
-        Returns:
-            One result per *scene*, in order; each holds one row, or is None where the scene failed twice.
-
-        Raises:
-            SceneEnvsError: the kernel refused (a missing dependency, an unknown asset).
+        Returns one result per *scene*, in order: a row of each array of the kernel, or None where the scene failed
+        twice. Raises SceneEnvsError where the kernel refuses (a missing dependency, an unknown asset).
         """
-        tasks: list[Task] = []
-        total = 0
-        for chunk in chunks:
-            tasks.append(self._task(kernel, chunk, dict(options), total))
-            total += len(chunk)
+        firsts = accumulate(map(len, chunks), initial=0)
+        tasks = [self._task(kernel, chunk, dict(options), first) for chunk, first in zip(chunks, firsts, strict=False)]
         rows: list[dict[str, Any] | None] = []
         for result in self.map(tasks):
             if isinstance(result, WorkerFailure):
@@ -103,7 +93,7 @@ class PhysicsPool(WorkerPool):
             (kernel, scene_type, arrays, options),
             f"physics of scenes {first} to {first + len(chunk) - 1}",
             once,
-            lambda: [self._task(kernel, chunk.row(index), options, first + index) for index in range(len(chunk))],
+            lambda: [self._task(kernel, chunk[row : row + 1], options, first + row) for row in range(len(chunk))],
         )
 
 

@@ -22,7 +22,7 @@ from scipy.sparse import csr_array
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import Collider, corner_tests, scene_pairs
 from scene_envs.physics.parts import LibraryGeometry, Rows
-from scene_envs.physics.placement import Budget, Objects, grouped_gaps, object_boxes, part_pairs, place
+from scene_envs.physics.placement import Budget, Level, Objects, grouped_gaps, object_boxes, part_pairs, place
 from scene_envs.physics.statics import components
 
 CLEARANCE = 2e-5
@@ -43,6 +43,71 @@ _ITERATIONS = 1e8
 """Matrix entries that the exact method may visit."""
 _ROWS_SQUARED = 25.0
 """A least-distance problem costs the square of its number of rows, divided by this, in units of work."""
+_AROUND = 0.06
+"""Parts further apart than this (m) are ignored when a translation is measured."""
+_OWN = 4
+"""Face directions tried per object pair from its deepest parts, and from its shallowest, besides the common ones."""
+_MAX_WALK_STEPS = 6
+"""Largest number of steps of a walk; each step leaves one overlapping part."""
+_DOWN = 3.0
+"""Cost factor of a translation down, out of a fixed object: an object that lies in a board belongs on it."""
+_UP = 1.4
+"""Cost factor of a vertical translation of two free objects: the lower one rests on something and cannot share it."""
+_BLOCKED = 20.0
+"""Cost factor of a translation that leaves the workspace or ends in a fixed object."""
+_REPEATED = 2.5
+"""Cost factor of a direction for each time that it was tried and did not help."""
+_SAME_DIRECTION = 0.7
+"""Cosine above which two directions count as the same."""
+_AXES = np.concatenate([np.eye(3), -np.eye(3)])
+Tried = dict[tuple[int, int], list[Array]]
+"""The directions tried for each object pair so far."""
+_HEAP = 3_000_000
+"""A group of objects whose boxes meet may be a heap when it takes more corner tests than this."""
+_DEEP = 5e-3
+"""Such a group is a heap when objects whose boxes have most in common overlap deeper than this (m)."""
+_LOOKED_AT = 3
+"""Number of object pairs measured for this: those whose common box is the largest share of the smaller box."""
+_WINDOWS = (0.3, 1.0, 4.0, 20.0)
+"""Half widths (m) of the cubes around a wanted place that are searched, one after the other."""
+_BINS = 16
+"""Coordinates tested along each axis come from this many equal intervals, at most two from each."""
+_FIXED = 1000
+"""Overlapping a box of a fixed object counts as much as overlapping this many free objects."""
+Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
+TOLERANCE = 1e-4
+"""Depth (m) up to which a projected scene counts as free of overlap."""
+WORK = 10_000.0
+"""Units of work (pairs of convex parts, or rows solved) until a search ends."""
+SEARCHES = 5
+"""Limit of searches per scene: the first from the given poses, the others after overlapping objects were spread."""
+_OVERLAPPING = 2_000_000
+"""Limit of corner tests in overlapping object pairs; more are too much work for minimum translations."""
+_ROUNDS = 30
+"""Largest number of rounds of a search; objects that still overlap after them are not moved further."""
+_PATIENCE = 10
+"""A search also ends after more rounds than this without any improvement."""
+_REFINEMENTS = 8
+"""Largest number of rounds spent on shortening the distances moved in a scene that is free of overlap."""
+_GAIN = 0.005
+"""Relative decrease of the squared distances moved from which another refinement is made."""
+_NEGLIGIBLE = 1e-8
+"""Sum of squared distances moved (m^2) below which no refinement is made."""
+_INSIDE = 1e-5
+"""Objects stay this far (m) inside the workspace, so that rounding does not take them out."""
+_OUTSIDE = 0.05
+"""Objects further than this (m) outside the workspace are no part of the arrangement and are not moved back inside."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """Translations of one scene's objects after projection."""
+
+    translation: Array  # (n, 3) m
+    residual_depth: float  # deepest overlap that is left, m
+    total_depth: float  # sum of the overlaps of object pairs that are left, m
+    overlapping: Mask  # (n,) bool, objects that still overlap another one
+    heap: bool = False  # whether the objects were a heap, which was spread before the first round
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +120,172 @@ class Planes(Rows):
     bound: Array  # (Q,) m
 
 
-def near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
+def project_objects(collider: Collider, objects: Objects, workspace: Corners) -> Projection:
+    """Project the free objects of one scene; those in the ``workspace`` (m) or close to it end inside it."""
+    home = objects.translation
+    bounds = _bounds(home, objects, workspace)
+    chosen, start, best = heaps(collider, objects), objects, None
+    wanted, heap = home, bool(chosen.any())
+    for _ in range(SEARCHES):
+        if chosen.any():
+            wanted = np.where(chosen[:, None], _spread(collider.library, start, chosen, home, bounds), wanted)
+        found = replace(_search(collider, replace(objects, translation=wanted), bounds), heap=heap)
+        if best is None or found.total_depth < best.total_depth:
+            best = found
+        if found.residual_depth <= TOLERANCE:
+            return found
+        chosen, start = found.overlapping & ~objects.fixed, replace(objects, translation=found.translation)
+    assert best is not None
+    return best
+
+
+def separated(
+    collider: Collider, objects: Objects, first: Index, second: Index, workspace: Corners, cost: Array
+) -> Array:
+    """Translations (n, 3) m of one scene after one round of projection of overlapping pairs (P,) and their neighbours.
+
+    A heap of objects, which would take too much work, is not changed. ``cost`` (3,) is that of a metre along each axis
+    of the world; the cheapest way out of an overlap is taken. Translations stay in the ``workspace`` (m).
+    """
+    if not len(first) or corner_tests(collider.library, objects, first, second).sum() > _OVERLAPPING:
+        return objects.translation
+    near_first, near_second = _near_pairs(collider, objects)
+    overlapping = np.concatenate([first, second])
+    kept = np.isin(near_first, overlapping) | np.isin(near_second, overlapping)
+    # Fixed objects are always among them: boards above limit how far an object can be lifted.
+    rows = np.unique(np.concatenate([near_first[kept], near_second[kept], np.flatnonzero(objects.fixed)]))
+    some = objects[rows]
+    one, other = np.searchsorted(rows, first), np.searchsorted(rows, second)
+    near = np.searchsorted(rows, near_first[kept]), np.searchsorted(rows, near_second[kept])
+    bounds = _bounds(some.translation, some, workspace)
+    home, walls, budget = some.translation, _walls(bounds), Budget(WORK)
+    result = objects.translation.copy()
+    result[rows] = _round(collider, some, home, one, other, near, bounds, walls, {}, budget, cost)
+    return result
+
+
+def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -> Projection:
+    """The nearest translations without overlap that a bounded number of rounds finds."""
+    home, walls, budget = objects.translation, _walls(bounds), Budget(WORK)
+    best, best_way = None, np.inf
+    waited = refinements = 0
+    tried: Tried = {}
+    current = replace(objects, translation=nearest(objects, home, walls, budget))
+    for _ in range(_ROUNDS):
+        first, second, measured = _measure(collider, current, budget)
+        way = float(((current.translation - home) ** 2).sum())
+        is_free = measured.residual_depth <= 0.5 * TOLERANCE
+        gain = best_way - way
+        waited += 1
+        if best is None or (measured.total_depth < best.total_depth and not is_free and best_way == np.inf):
+            best, waited = measured, 0
+        if is_free and way < best_way:
+            best, best_way = measured, way
+        if is_free:
+            refinements += 1
+            if refinements > _REFINEMENTS or way < _NEGLIGIBLE or gain < _GAIN * way:
+                break
+        elif waited > _PATIENCE:
+            break
+        elif best_way < np.inf:
+            break  # a refinement led to another overlap: the last result without overlap is kept
+        if budget.is_spent or corner_tests(collider.library, current, first, second).sum() > _OVERLAPPING:
+            break
+        near = _near_pairs(collider, current)
+        translation = _round(collider, current, home, first, second, near, bounds, walls, tried, budget)
+        current = replace(current, translation=translation)
+    assert best is not None
+    inside = _inside(best.translation, bounds)
+    return best if inside is best.translation else _measure(collider, replace(objects, translation=inside), budget)[2]
+
+
+def _round(
+    collider: Collider,
+    current: Objects,
+    home: Array,
+    first: Index,
+    second: Index,
+    near: tuple[Index, Index],
+    bounds: tuple[Array, Array],
+    walls: Planes,
+    tried: Tried,
+    budget: Budget,
+    cost: Array | None = None,
+) -> Array:
+    """The next translations: they free overlapping pairs (``first``, ``second``) and keep other ``near`` ones apart."""
+    near_first, near_second = near
+    extra = np.zeros((len(near_first), 3))
+    if len(first):
+        count = len(current)
+        moves = _minimum_translations(collider, current, first, second, bounds, tried, budget, cost)
+        place_of = np.searchsorted(near_first * count + near_second, first * count + second)
+        extra[place_of] = moves
+    planes = _separating_planes(collider, current, near_first, near_second, extra, home, budget)
+    return nearest(current, home, planes + walls, budget, cost)
+
+
+def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:
+    """Object pairs whose fine parts overlap deeper than half the tolerance, and the overlap of the whole scene."""
+    pairs = collider.pairs(objects)
+    budget.spent += len(pairs.contacts.gap)
+    deep = pairs.depth > 0.5 * TOLERANCE
+    first, second = pairs.first[deep], pairs.second[deep]
+    overlapping = np.isin(np.arange(len(objects)), np.concatenate([first, second]))
+    residual, total = float(pairs.depth.max(initial=0.0)), float(pairs.depth.sum())
+    return first, second, Projection(objects.translation, residual, total, overlapping)
+
+
+def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, Array]:
+    """Lowest and highest translations (n, 3); infinite for fixed objects and for objects far outside."""
+    low, high = np.array(workspace[0]), np.array(workspace[1])
+    loose = objects.fixed | ((home < low - _OUTSIDE) | (home > high + _OUTSIDE)).any(axis=1)
+    return np.where(loose[:, None], -np.inf, low + _INSIDE), np.where(loose[:, None], np.inf, high - _INSIDE)
+
+
+def _inside(translation: Array, bounds: tuple[Array, Array]) -> Array:
+    """The translations; if slack let some leave the workspace, they are put back."""
+    clipped = np.clip(translation, *bounds)
+    return clipped if (np.abs(clipped - translation) > 0.9 * _INSIDE).any() else translation
+
+
+def _walls(bounds: tuple[Array, Array]) -> Planes:
+    """The bounds as half-spaces."""
+    low, high = (np.nonzero(np.isfinite(limit)) for limit in bounds)
+    row, axis = np.concatenate([low[0], high[0]]), np.concatenate([low[1], high[1]])
+    sign = np.repeat([1.0, -1.0], [len(low[0]), len(high[0])])
+    limits = np.concatenate([bounds[0][low], -bounds[1][high]])
+    direction = np.zeros((len(row), 3))
+    direction[np.arange(len(row)), axis] = sign
+    return Planes(np.full(len(row), -1, dtype=np.int64), row, direction, limits)
+
+
+def heaps(collider: Collider, objects: Objects) -> Mask:
+    """(n,) free objects of one scene in groups that overlap so much that exact tests would take too long.
+
+    Objects nested as intended meet as many others but hardly overlap, so they are no heap.
+    """
+    low, high = object_boxes(place(collider.library, objects, "coarse"))
+    first, second = scene_pairs(objects)
+    meet = ((low[first] < high[second]) & (low[second] < high[first])).all(axis=1)
+    first, second = first[meet], second[meet]
+    free = ~objects.fixed
+    both = free[first] & free[second]
+    group = components(len(objects), first[both], second[both])
+    owner = group[np.where(free[first], first, second)]
+    tests = np.bincount(owner, weights=corner_tests(collider.library, objects, first, second), minlength=len(objects))
+    chosen = np.zeros(len(objects), dtype=bool)
+    for number in np.flatnonzero(tests > _HEAP):
+        a, b = first[owner == number], second[owner == number]
+        common = np.prod(np.minimum(high[a], high[b]) - np.maximum(low[a], low[b]), axis=1)
+        smaller = np.minimum(np.prod(high[a] - low[a], axis=1), np.prod(high[b] - low[b], axis=1))
+        most = np.argsort(-common / np.maximum(smaller, 1e-12), kind="stable")[:_LOOKED_AT]
+        looked_at = objects[np.unique(np.concatenate([a[most], b[most]]))]
+        if collider.pairs(looked_at).depth.max(initial=0.0) > _DEEP:
+            chosen |= free & (group == number)
+    return chosen
+
+
+def _near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
     """Object pairs of one scene whose boxes are within reach of each other: (P,), (P,)."""
     low, high = object_boxes(place(collider.library, objects, "coarse"))
     first, second = scene_pairs(objects)
@@ -63,57 +293,34 @@ def near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
     return first[near], second[near]
 
 
-def separating_planes(
+def _separating_planes(
     collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array, budget: Budget
 ) -> Planes:
-    """Planes that keep object pairs apart.
+    """Planes that keep object pairs (P,) of one scene apart; ``budget`` is charged with one unit per plane.
 
     Every pair of parts gets a face plane that separates the two parts now. Among several such planes the one with the
-    least move away from home is taken. Coarse parts are used where they are already apart, fine ones elsewhere.
-
-    Args:
-        collider: Geometry and exact distances.
-        objects: Objects of one scene, at their current translations.
-        first, second: (P,) object rows.
-        extra: (P, 3) vector added to the offset of each pair, m: the minimum translation, for pairs that overlap.
-        home: (n, 3) wanted translations of the objects, m.
-        budget: Work budget, charged with one unit per plane.
+    least move away from ``home`` (n, 3) m is taken. Coarse parts are used where they are already apart, fine ones
+    elsewhere. ``extra`` (P, 3) m is added to the offset of each pair: the minimum translation of those that overlap.
     """
-    coarse, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
-    budget.spend(len(coarse.pair))
-    nested = np.unique(coarse.pair[~apart])
+    coarse, pair, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
+    budget.spent += len(pair)
+    nested = np.unique(pair[~apart])
     if not len(nested):
-        return coarse.planes(np.ones(len(coarse.pair), dtype=bool))
-    kept = coarse.planes(~np.isin(coarse.pair, nested))
-    fine, apart = _planes_at("fine", collider, objects, first[nested], second[nested], extra[nested], home)
-    budget.spend(len(fine.pair))
-    return kept + fine.planes(np.ones(len(fine.pair), dtype=bool))
-
-
-@dataclass(frozen=True, eq=False)
-class _PartPlanes:
-    """One plane per near pair of parts; ``pair`` (Q,) is the index of the object pair."""
-
-    pair: Index
-    first: Index
-    second: Index
-    direction: Array
-    bound: Array
-
-    def planes(self, rows: Mask) -> Planes:
-        """As half-spaces for the objects."""
-        return Planes(self.first[rows], self.second[rows], self.direction[rows], self.bound[rows])
+        return coarse
+    fine, _, _ = _planes_at("fine", collider, objects, first[nested], second[nested], extra[nested], home)
+    budget.spent += len(fine.bound)
+    return coarse[~np.isin(pair, nested)] + fine
 
 
 def _planes_at(
-    level: str, collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array
-) -> tuple[_PartPlanes, Mask]:
-    placed = place(collider.library, objects, level)  # type: ignore[arg-type]
+    level: Level, collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array
+) -> tuple[Planes, Index, Mask]:
+    """A plane for each near pair of parts (Q,), its object pair (Q,), and whether the parts are apart (Q,)."""
+    placed = place(collider.library, objects, level)
     pair, a, b = part_pairs(placed, first, second)
     move = extra[pair]
-    near = ((placed.low[a] <= placed.high[b] + move + _REACH) & (placed.low[b] + move <= placed.high[a] + _REACH)).all(
-        axis=1
-    )
+    near = (placed.low[a] <= placed.high[b] + move + _REACH).all(axis=1)
+    near &= (placed.low[b] + move <= placed.high[a] + _REACH).all(axis=1)
     pair, a, b = pair[near], a[near], b[near]
     offset = objects.translation[second] - objects.translation[first] + extra
     away = (home[second] - home[first] - offset)[pair]
@@ -127,7 +334,7 @@ def _planes_at(
         line = np.arange(len(rows))
         direction[rows], best[rows] = normals[line, chosen], largest
         bound[rows] = np.einsum("qi,qi->q", direction[rows], offset[rows]) - gaps[line, chosen] + CLEARANCE
-    return _PartPlanes(pair, first[pair], second[pair], direction, bound), best >= -_APART
+    return Planes(first[pair], second[pair], direction, bound), pair, best >= -_APART
 
 
 def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget, cost: Array | None = None) -> Array:
@@ -143,8 +350,7 @@ def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget, cost:
         return nearest(objects, home * cost, scaled, budget) / cost
     result = home.copy()
     free = ~objects.fixed
-    mobile = lambda rows: (rows >= 0) & free[rows]  # noqa: E731
-    moves_first, moves_second = mobile(planes.first), mobile(planes.second)
+    moves_first, moves_second = ((rows >= 0) & free[rows] for rows in (planes.first, planes.second))
     both = moves_first & moves_second
     label = components(len(objects), planes.first[both], planes.second[both])
     owner = np.where(moves_second, label[planes.second], label[planes.first])
@@ -178,7 +384,7 @@ def least_distance(matrix: Array, needed: Array, budget: Budget) -> Array:
     while broken.any() and not budget.is_spent:
         used = used | broken
         rows = np.flatnonzero(used)
-        budget.spend(min(len(rows), _EXACT) ** 2 / _ROWS_SQUARED)
+        budget.spent += min(len(rows), _EXACT) ** 2 / _ROWS_SQUARED
         x = _exact(matrix[rows], needed[rows]) if len(rows) <= _EXACT else _approximate(matrix[rows], needed[rows])
         broken = ~used & (matrix @ x < needed - _MET)
     return x
@@ -220,29 +426,7 @@ def _approximate(matrix: Array, needed: Array) -> Array:
     return transposed @ multipliers  # type: ignore[no-any-return]
 
 
-_AROUND = 0.06
-"""Parts further apart than this (m) are ignored when a translation is measured."""
-_OWN = 4
-"""Face directions tried per object pair from its deepest parts, and from its shallowest, besides the common ones."""
-_MAX_WALK_STEPS = 6
-"""Largest number of steps of a walk; each step leaves one overlapping part."""
-_DOWN = 3.0
-"""Cost factor of a translation down, out of a fixed object: an object that lies in a board belongs on it."""
-_UP = 1.4
-"""Cost factor of a vertical translation of two free objects: the lower one rests on something and cannot share it."""
-_BLOCKED = 20.0
-"""Cost factor of a translation that leaves the workspace or ends in a fixed object."""
-_REPEATED = 2.5
-"""Cost factor of a direction for each time that it was tried and did not help."""
-_SAME_DIRECTION = 0.7
-"""Cosine above which two directions count as the same."""
-_AXES = np.concatenate([np.eye(3), -np.eye(3)])
-
-Tried = dict[tuple[int, int], list[Array]]
-"""The directions tried for each object pair so far."""
-
-
-def minimum_translations(
+def _minimum_translations(
     collider: Collider,
     objects: Objects,
     first: Index,
@@ -254,20 +438,14 @@ def minimum_translations(
 ) -> Array:
     """(P, 3) m: translations that free overlapping object pairs when they are added to the offsets of the pairs.
 
-    Args:
-        collider: Geometry of the assets.
-        objects: Objects of one scene.
-        first, second: (P,) object rows.
-        bounds: Lowest and highest translations (n, 3), (n, 3) m.
-        tried: Directions that did not help; the directions of the returned translations are added to them.
-        budget: Work budget, charged with one unit per pair of parts.
-        cost: (3,) cost of a metre along each axis of the world; None for 1.
+    Directions that were ``tried`` and did not help cost more; the directions of the result are added to them. ``cost``
+    (3,) is that of a metre along each axis of the world. ``budget`` is charged with one unit per pair of parts.
     """
     placed = place(collider.library, objects, "fine")
     pair, a, b = part_pairs(placed, first, second)
     near = ((placed.low[a] <= placed.high[b] + _AROUND) & (placed.low[b] <= placed.high[a] + _AROUND)).all(axis=1)
     pair, a, b = pair[near], a[near], b[near]
-    budget.spend(len(pair))
+    budget.spent += len(pair)
     offset = objects.translation[second] - objects.translation[first]
     groups = list(grouped_gaps(collider.library, placed.parts, a, b, offset[pair]))
     walk = _walk(objects, first, second, pair, groups, bounds)
@@ -276,13 +454,14 @@ def minimum_translations(
     costs = lengths * _weights(collider, objects, first, second, directions, lengths, bounds)
     if cost is not None:
         costs *= np.linalg.norm(directions * cost, axis=-1)
+    best = np.empty(len(first), dtype=np.int64)
     for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-        for old in tried.get(key, ()):
+        before = tried.setdefault(key, [])
+        for old in before:
             costs[row, directions[row] @ old > _SAME_DIRECTION] *= _REPEATED
-    best = costs.argmin(axis=1)
+        best[row] = costs[row].argmin()
+        before.append(directions[row, best[row]])
     line = np.arange(len(first))
-    for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-        tried.setdefault(key, []).append(directions[row, best[row]])
     return directions[line, best] * (lengths[line, best] + CLEARANCE)[:, None]  # type: ignore[no-any-return]
 
 
@@ -403,13 +582,8 @@ def _weights(
     weight = np.ones(lengths.shape)
     fixed = objects.fixed[first] | objects.fixed[second]
     # The motion of the free object, or of the upper one of two.
-    upper = np.where(
-        objects.fixed[first],
-        second,
-        np.where(
-            objects.fixed[second] | (objects.translation[first, 2] > objects.translation[second, 2]), first, second
-        ),
-    )
+    first_above = objects.fixed[second] | (objects.translation[first, 2] > objects.translation[second, 2])
+    upper = np.where(~objects.fixed[first] & first_above, first, second)
     motion = np.where((upper == second)[:, None, None], directions, -directions)
     weight[fixed[:, None] & (motion[..., 2] < -0.7)] *= _DOWN
     weight[~fixed[:, None] & (np.abs(motion[..., 2]) > 0.7)] *= _UP
@@ -421,66 +595,20 @@ def _weights(
         low, high = object_boxes(place(collider.library, objects, "coarse"))
         boards = place(collider.library, objects[objects.fixed], "coarse")
         rise = np.where(motion[..., 2] > 0.7, lengths, 0.0)  # (P, D)
-        over = (boards.low[None, :, :2] < high[upper][:, None, :2]) & (
-            boards.high[None, :, :2] > low[upper][:, None, :2]
-        )
-        above = over.all(axis=2) & (boards.low[None, :, 2] > 0.5 * (low[upper] + high[upper])[:, None, 2])
+        above = (boards.low[None, :, :2] < high[upper][:, None, :2]).all(axis=2)
+        above &= (boards.high[None, :, :2] > low[upper][:, None, :2]).all(axis=2)
+        above &= boards.low[None, :, 2] > 0.5 * (low[upper] + high[upper])[:, None, 2]
         room = np.where(above, boards.low[None, :, 2] - high[upper][:, None, 2], np.inf).min(axis=1)
         weight[(rise > np.maximum(room, 0.0)[:, None]) & ~fixed[:, None]] *= _BLOCKED
     return weight
 
 
-_HEAP = 3_000_000
-"""A group of objects whose boxes meet may be a heap when it takes more corner tests than this."""
-_DEEP = 5e-3
-"""Such a group is a heap when objects whose boxes have most in common overlap deeper than this (m)."""
-_LOOKED_AT = 3
-"""Number of object pairs measured for this: those whose common box is the largest share of the smaller box."""
-_WINDOWS = (0.3, 1.0, 4.0, 20.0)
-"""Half widths (m) of the cubes around a wanted place that are searched, one after the other."""
-_BINS = 16
-"""Coordinates tested along each axis come from this many equal intervals, at most two from each."""
-_FIXED = 1000
-"""Overlapping a box of a fixed object counts as much as overlapping this many free objects."""
-
-
-def heaps(collider: Collider, objects: Objects) -> Mask:
-    """(n,) free objects of one scene in groups that overlap so much that exact tests would take too long.
-
-    Objects nested as intended meet as many others but hardly overlap, so they are no heap.
-    """
-    low, high = object_boxes(place(collider.library, objects, "coarse"))
-    first, second = scene_pairs(objects)
-    meet = ((low[first] < high[second]) & (low[second] < high[first])).all(axis=1)
-    first, second = first[meet], second[meet]
-    free = ~objects.fixed
-    both = free[first] & free[second]
-    group = components(len(objects), first[both], second[both])
-    owner = group[np.where(free[first], first, second)]
-    tests = np.bincount(owner, weights=corner_tests(collider.library, objects, first, second), minlength=len(objects))
-    chosen = np.zeros(len(objects), dtype=bool)
-    for number in np.flatnonzero(tests > _HEAP):
-        a, b = first[owner == number], second[owner == number]
-        common = np.prod(np.minimum(high[a], high[b]) - np.maximum(low[a], low[b]), axis=1)
-        smaller = np.minimum(np.prod(high[a] - low[a], axis=1), np.prod(high[b] - low[b], axis=1))
-        most = np.argsort(-common / np.maximum(smaller, 1e-12), kind="stable")[:_LOOKED_AT]
-        looked_at = objects[np.unique(np.concatenate([a[most], b[most]]))]
-        if collider.pairs(looked_at).depth.max(initial=0.0) > _DEEP:
-            chosen |= free & (group == number)
-    return chosen
-
-
-def spread(
+def _spread(
     library: LibraryGeometry, objects: Objects, chosen: Mask, wanted: Array, bounds: tuple[Array, Array]
 ) -> Array:
-    """Translations (n, 3) m at which the boxes of the chosen objects meet no other box, as far as there is room.
+    """Translations (n, 3) m, near the ``wanted`` ones (n, 3), at which the boxes of the chosen objects meet no other.
 
-    Args:
-        library: Geometry of the assets.
-        objects: Objects of one scene; those not chosen stay.
-        chosen: (n,) free objects to place anew.
-        wanted: (n, 3) wanted translations of the chosen objects, m.
-        bounds: Lowest and highest translations (n, 3), (n, 3) m.
+    Where there is no room, they meet as few others as possible. Objects that are not chosen stay.
     """
     coarse = place(library, objects, "coarse")
     low, high = object_boxes(coarse)
@@ -544,191 +672,3 @@ def _lines(faces: Array, wanted: float, start: float, end: float) -> Array:
     highest = np.searchsorted(bins, np.arange(_BINS), "right") - 1
     used = highest >= lowest
     return np.unique(np.concatenate([[wanted, start, end], inside[lowest[used]], inside[highest[used]]]))
-
-
-Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
-
-TOLERANCE = 1e-4
-"""Depth (m) up to which a projected scene counts as free of overlap."""
-WORK = 10_000.0
-"""Units of work (pairs of convex parts, or rows solved) until a search ends."""
-SEARCHES = 5
-"""Limit of searches per scene: the first from the given poses, the others after overlapping objects were spread."""
-_OVERLAPPING = 2_000_000
-"""Limit of corner tests in overlapping object pairs; more are too much work for minimum translations."""
-_ROUNDS = 30
-"""Largest number of rounds of a search; objects that still overlap after them are not moved further."""
-_PATIENCE = 10
-"""A search also ends after more rounds than this without any improvement."""
-_REFINEMENTS = 8
-"""Largest number of rounds spent on shortening the distances moved in a scene that is free of overlap."""
-_GAIN = 0.005
-"""Relative decrease of the squared distances moved from which another refinement is made."""
-_NEGLIGIBLE = 1e-8
-"""Sum of squared distances moved (m^2) below which no refinement is made."""
-_INSIDE = 1e-5
-"""Objects stay this far (m) inside the workspace, so that rounding does not take them out."""
-_OUTSIDE = 0.05
-"""Objects further than this (m) outside the workspace are no part of the arrangement and are not moved back inside."""
-
-
-@dataclass(frozen=True, eq=False)
-class Projection:
-    """Translations of one scene's objects after projection."""
-
-    translation: Array  # (n, 3) m
-    residual_depth: float  # deepest overlap that is left, m
-    total_depth: float  # sum of the overlaps of object pairs that are left, m
-    overlapping: Mask  # (n,) bool, objects that still overlap another one
-    heap: bool = False  # whether the objects were a heap, which was spread before the first round
-
-
-def project_objects(collider: Collider, objects: Objects, workspace: Corners) -> Projection:
-    """Project the objects of one scene.
-
-    Args:
-        collider: Geometry of the assets, and the measure of overlap.
-        objects: Objects of one scene; fixed ones do not move.
-        workspace: Lowest and highest corner (m) for the translations of objects in it or close to it.
-    """
-    home = objects.translation
-    bounds = _bounds(home, objects, workspace)
-    chosen, start, best = heaps(collider, objects), objects, None
-    wanted, heap = home, bool(chosen.any())
-    for _ in range(SEARCHES):
-        if chosen.any():
-            wanted = np.where(chosen[:, None], spread(collider.library, start, chosen, home, bounds), wanted)
-        found = replace(_search(collider, replace(objects, translation=wanted), bounds), heap=heap)
-        if best is None or found.total_depth < best.total_depth:
-            best = found
-        if found.residual_depth <= TOLERANCE:
-            return found
-        chosen, start = found.overlapping & ~objects.fixed, replace(objects, translation=found.translation)
-    assert best is not None
-    return best
-
-
-def separated(
-    collider: Collider, objects: Objects, first: Index, second: Index, workspace: Corners, cost: Array
-) -> Array:
-    """Translations (n, 3) after one round of projection of overlapping objects and their neighbours.
-
-    A heap of objects, which would take too much work, is not changed.
-
-    Args:
-        collider: Geometry of the assets.
-        objects: Objects of one scene; fixed ones do not move.
-        first, second: (P,) object rows of the pairs that overlap.
-        workspace: Lowest and highest corner (m) for the translations.
-        cost: (3,) cost of a metre along each axis of the world; the cheapest way out of an overlap is taken.
-    """
-    if not len(first) or corner_tests(collider.library, objects, first, second).sum() > _OVERLAPPING:
-        return objects.translation
-    near_first, near_second = near_pairs(collider, objects)
-    overlapping = np.concatenate([first, second])
-    kept = np.isin(near_first, overlapping) | np.isin(near_second, overlapping)
-    # Fixed objects are always among them: boards above limit how far an object can be lifted.
-    rows = np.unique(np.concatenate([near_first[kept], near_second[kept], np.flatnonzero(objects.fixed)]))
-    some = objects[rows]
-    one, other = np.searchsorted(rows, first), np.searchsorted(rows, second)
-    near = np.searchsorted(rows, near_first[kept]), np.searchsorted(rows, near_second[kept])
-    bounds = _bounds(some.translation, some, workspace)
-    home, walls, budget = some.translation, _walls(bounds), Budget(WORK)
-    result = objects.translation.copy()
-    result[rows] = _round(collider, some, home, one, other, near, bounds, walls, {}, budget, cost)
-    return result
-
-
-def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -> Projection:
-    """The nearest translations without overlap that a bounded number of rounds finds."""
-    home, walls, budget = objects.translation, _walls(bounds), Budget(WORK)
-    best, best_way = None, np.inf
-    waited = refinements = 0
-    tried: Tried = {}
-    current = replace(objects, translation=nearest(objects, home, walls, budget))
-    for _ in range(_ROUNDS):
-        first, second, measured = _measure(collider, current, budget)
-        way = float(((current.translation - home) ** 2).sum())
-        is_free = measured.residual_depth <= 0.5 * TOLERANCE
-        gain = best_way - way
-        waited += 1
-        if best is None or (measured.total_depth < best.total_depth and not is_free and best_way == np.inf):
-            best, waited = measured, 0
-        if is_free and way < best_way:
-            best, best_way = measured, way
-        if is_free:
-            refinements += 1
-            if refinements > _REFINEMENTS or way < _NEGLIGIBLE or gain < _GAIN * way:
-                break
-        elif waited > _PATIENCE:
-            break
-        elif best_way < np.inf:
-            break  # a refinement led to another overlap: the last result without overlap is kept
-        if budget.is_spent or corner_tests(collider.library, current, first, second).sum() > _OVERLAPPING:
-            break
-        near = near_pairs(collider, current)
-        translation = _round(collider, current, home, first, second, near, bounds, walls, tried, budget)
-        current = replace(current, translation=translation)
-    assert best is not None
-    inside = _inside(best.translation, bounds)
-    return best if inside is best.translation else _measure(collider, replace(objects, translation=inside), budget)[2]
-
-
-def _round(
-    collider: Collider,
-    current: Objects,
-    home: Array,
-    first: Index,
-    second: Index,
-    near: tuple[Index, Index],
-    bounds: tuple[Array, Array],
-    walls: Planes,
-    tried: Tried,
-    budget: Budget,
-    cost: Array | None = None,
-) -> Array:
-    """The next translations: they free overlapping pairs (``first``, ``second``) and keep other ``near`` ones apart."""
-    near_first, near_second = near
-    extra = np.zeros((len(near_first), 3))
-    if len(first):
-        count = len(current)
-        moves = minimum_translations(collider, current, first, second, bounds, tried, budget, cost)
-        place_of = np.searchsorted(near_first * count + near_second, first * count + second)
-        extra[place_of] = moves
-    planes = separating_planes(collider, current, near_first, near_second, extra, home, budget)
-    return nearest(current, home, planes + walls, budget, cost)
-
-
-def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:
-    """Object pairs whose fine parts overlap deeper than half the tolerance, and the overlap of the whole scene."""
-    pairs = collider.pairs(objects)
-    budget.spend(len(pairs.contacts.gap))
-    deep = pairs.depth > 0.5 * TOLERANCE
-    first, second = pairs.first[deep], pairs.second[deep]
-    overlapping = np.isin(np.arange(len(objects)), np.concatenate([first, second]))
-    residual, total = float(pairs.depth.max(initial=0.0)), float(pairs.depth.sum())
-    return first, second, Projection(objects.translation, residual, total, overlapping)
-
-
-def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, Array]:
-    """Lowest and highest translations (n, 3); infinite for fixed objects and for objects far outside."""
-    low, high = np.array(workspace[0]), np.array(workspace[1])
-    loose = objects.fixed | ((home < low - _OUTSIDE) | (home > high + _OUTSIDE)).any(axis=1)
-    return np.where(loose[:, None], -np.inf, low + _INSIDE), np.where(loose[:, None], np.inf, high - _INSIDE)
-
-
-def _inside(translation: Array, bounds: tuple[Array, Array]) -> Array:
-    """The translations; if slack let some leave the workspace, they are put back."""
-    clipped = np.clip(translation, *bounds)
-    return clipped if (np.abs(clipped - translation) > 0.9 * _INSIDE).any() else translation
-
-
-def _walls(bounds: tuple[Array, Array]) -> Planes:
-    """The bounds as half-spaces."""
-    low, high = (np.nonzero(np.isfinite(limit)) for limit in bounds)
-    row, axis = np.concatenate([low[0], high[0]]), np.concatenate([low[1], high[1]])
-    sign = np.repeat([1.0, -1.0], [len(low[0]), len(high[0])])
-    limits = np.concatenate([bounds[0][low], -bounds[1][high]])
-    direction = np.zeros((len(row), 3))
-    direction[np.arange(len(row)), axis] = sign
-    return Planes(np.full(len(row), -1, dtype=np.int64), row, direction, limits)

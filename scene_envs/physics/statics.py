@@ -1,4 +1,4 @@
-"""Statics of upright stacks: objects whose rest is found without simulation.
+"""Support and rest: objects whose rest is found without simulation, and those that must be simulated together.
 
 An upright object rests on the one object under it when the centre of mass of the object and everything it carries lies
 inside both the object's foot and the flat face below. From the lowest object up, gaps are closed and small overlaps
@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import NEAR, scene_pairs
-from scene_envs.physics.parts import GRAVITY, AssetGeometry, ContactFace, LibraryGeometry, PartGeometry, Rows, apply
+from scene_envs.physics.parts import GRAVITY, AssetGeometry, ContactFace, LibraryGeometry, Rows, apply, padded
 from scene_envs.physics.placement import Contacts, ObjectPairs, Objects
 
 _FLAT = 3e-4
@@ -31,6 +31,14 @@ _TOUCHING = 1e-4
 """Overlap (m) with a neighbouring object that is too small to move an object."""
 _DEEPEST = 2e-3
 """An object that is sunk deeper than this (m) into its support does not simply rise."""
+_REACH = 2e-3
+"""Pairs further apart than this (m) do not carry each other."""
+_SAME_DEPTH = 1e-4
+"""Coarse and fine overlap may differ by this much (m) and still act alike."""
+_UPRIGHT = 0.999
+"""Cosine of the tilt up to which faces count as facing each other."""
+_CLEAR = np.array([0.01, 0.01, 0.06])
+"""Objects are simulated in one cluster when they are within this (m) of each other along each axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,21 +61,17 @@ class _Polygons:
 
     @classmethod
     def of(cls, polygons: list[tuple[float, Array] | None]) -> _Polygons:
-        width = max((len(polygon[1]) for polygon in polygons if polygon is not None), default=3)
-        count = len(polygons)
-        height, offsets = np.full(count, np.nan), np.full((count, width), -1.0)
-        corners, normals = np.zeros((count, width, 2)), np.zeros((count, width, 2))
-        for index, polygon in enumerate(polygons):
+        rows = []
+        for polygon in polygons:
             if polygon is None:
+                rows.append((np.nan, np.zeros((1, 2)), np.zeros((1, 2)), np.array([-1.0])))
                 continue
-            points = polygon[1]
+            height, points = polygon
             edge = np.roll(points, -1, axis=0) - points
             normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
-            height[index] = polygon[0]
-            for target, values in ((corners, points), (normals, normal), (offsets, (normal * points).sum(axis=1))):
-                target[index] = values[0]
-                target[index, : len(points)] = values
-        return cls(height, corners, normals, offsets)
+            rows.append((height, points, normal, (normal * points).sum(axis=1)))
+        heights, *columns = zip(*rows, strict=True)
+        return cls(np.array(heights), *map(padded, columns))
 
     def outside(self, rows: Index, points: Array) -> Array:
         """(Q, K) m, distance of points (Q, K, 2) in the asset frame outside polygons ``rows`` (Q,)."""
@@ -83,19 +87,15 @@ class Statics:
         self._library = library
         self._mass = np.array([float(asset.asset.mass) for asset in library.assets])
         self._foot = _Polygons.of([_foot(asset) for asset in library.assets])
-        self._solid = np.array([asset.bottom is not None and asset.bottom.hole == 0 for asset in library.assets])
-        self._surface = _Polygons.of([_surface(part) for part in library.parts])
+        self._surface = _Polygons.of([_surface(part.vertices) for part in library.parts])
         for asset in library.assets:
             if asset.is_hollow:  # the coarse parts have tops where there is nothing to stand on
                 self._surface.offsets[asset.coarse.ids] = -np.inf
-        self._rim = _Polygons.of([_rim(asset) for asset in library.assets])
-        tops, bottoms = [asset.top for asset in library.assets], [asset.bottom for asset in library.assets]
-        self._hole_top = np.array([np.inf if top is None else top.hole for top in tops])
-        self._rim_reach = np.array([0.0 if top is None else top.corners for top in tops])
-        self._rim_center = np.array([(0.0, 0.0) if top is None else top.center for top in tops])
-        self._hole_foot = np.array([np.inf if bottom is None else bottom.hole for bottom in bottoms])
-        self._foot_reach = np.array([0.0 if bottom is None else bottom.corners for bottom in bottoms])
-        self._foot_center = np.array([(0.0, 0.0) if bottom is None else bottom.center for bottom in bottoms])
+        # the top face may be a rim round a hole
+        rims = [None if asset.top is None else _surface(asset.fine.vertices) for asset in library.assets]
+        self._rim = _Polygons.of(rims)
+        self._top = _Faces.of([asset.top for asset in library.assets])
+        self._bottom = _Faces.of([asset.bottom for asset in library.assets])
 
     def at_rest(self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, duration: float) -> Rest:
         """Objects of one or more scenes that need no simulation for ``duration`` seconds."""
@@ -165,20 +165,21 @@ class Statics:
         q = np.flatnonzero(inside)
         up = objects.category[upper[q]]
         corners = _into(objects, lower[q], _out_of(objects, upper[q], self._foot.corners[up]))
-        good[q] = self._solid[up] | (self._surface.outside(part[q], corners).max(axis=1) < 0.0)
+        good[q] = (self._bottom.hole[up] == 0) | (self._surface.outside(part[q], corners).max(axis=1) < 0.0)
         # The test of the rim gives the same result for all parts of the two objects.
         _, leading = np.unique(upper, return_index=True)
         q = leading[candidates[leading]]
         up, down = objects.category[upper[q]], objects.category[lower[q]]
         at_rim = np.abs(self._rim.height[down] - self._surface.height[part[q]]) < _MEETS
         offset = np.linalg.norm(
-            _into(objects, lower[q], _out_of(objects, upper[q], self._foot_center[up][:, None]))[:, 0]
-            - self._rim_center[down],
+            _into(objects, lower[q], _out_of(objects, upper[q], self._bottom.center[up][:, None]))[:, 0]
+            - self._top.center[down],
             axis=1,
         )
         at_rim &= self._rim.outside(down, local[q])[:, 0] < -_BALANCE
-        at_rim &= offset <= self._foot_reach[up] - self._hole_top[down]
-        at_rim &= (self._hole_foot[up] == 0) | (offset <= self._rim_reach[down] - self._hole_foot[up])
+        hole = self._bottom.hole[up]
+        at_rim &= offset <= self._bottom.corners[up] - self._top.hole[down]
+        at_rim &= (hole == 0) | (offset <= self._top.corners[down] - hole)
         good[q] |= at_rim
         return good
 
@@ -257,32 +258,11 @@ def _foot(asset: AssetGeometry) -> tuple[float, Array] | None:
     return None if outline is None else (height, outline)
 
 
-def _surface(part: PartGeometry) -> tuple[float, Array] | None:
-    """Height and outline of a part's flat top."""
-    height = float(part.vertices[:, 2].max())
-    outline = _outline(part.vertices[part.vertices[:, 2] > height - 1e-5][:, :2])
+def _surface(vertices: Array) -> tuple[float, Array] | None:
+    """Height and outline of the flat top of the corners (V, 3) of a part or of all parts."""
+    height = float(vertices[:, 2].max())
+    outline = _outline(vertices[vertices[:, 2] > height - 1e-5][:, :2])
     return None if outline is None else (height, outline)
-
-
-def _rim(asset: AssetGeometry) -> tuple[float, Array] | None:
-    """Height and outline of the asset's top face, which may be a rim round a hole."""
-    if asset.top is None:
-        return None
-    vertices = asset.fine.vertices
-    outline = _outline(vertices[vertices[:, 2] > asset.top.height - 1e-5][:, :2])
-    return None if outline is None else (asset.top.height, outline)
-
-
-_REACH = 2e-3
-"""Pairs further apart than this (m) do not carry each other."""
-_SAME_DEPTH = 1e-4
-"""Coarse and fine overlap may differ by this much (m) and still act alike."""
-_UPRIGHT = 0.999
-"""Cosine of the tilt up to which faces count as facing each other."""
-_CLEAR = 0.01
-_CLEAR_ABOVE = 0.06
-"""Objects are simulated in one cluster when they are within ``_CLEAR`` (m) of each other sideways and within
-``_CLEAR_ABOVE`` (m) in height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,13 +357,12 @@ class Support:
         return depth
 
 
-def clusters(objects: Objects, low: Array, high: Array, sideways: float = _CLEAR) -> Index:
+def clusters(objects: Objects, low: Array, high: Array) -> Index:
     """(n,) a number per free object of one scene, shared by those near each other; -1 for fixed ones."""
     rows = np.flatnonzero(~objects.fixed)
-    margin = np.array([sideways, sideways, _CLEAR_ABOVE])
     first, second = np.triu_indices(len(rows), k=1)
     first, second = rows[first], rows[second]
-    near = ((low[first] <= high[second] + margin) & (low[second] <= high[first] + margin)).all(axis=1)
+    near = ((low[first] <= high[second] + _CLEAR) & (low[second] <= high[first] + _CLEAR)).all(axis=1)
     return np.where(objects.fixed, -1, components(len(objects), first[near], second[near]))
 
 
@@ -416,6 +395,4 @@ def _face_center(objects: Objects, rows: Index, faces: _Faces) -> Array:
     """(P, 3) world position of each object's face centre; NaN where it has none."""
     category = objects.category[rows]
     local = np.column_stack([faces.center[category], faces.height[category]])
-    r = objects.rotation[rows]
-    moved = r[:, :, 0] * local[:, 0:1] + r[:, :, 1] * local[:, 1:2] + r[:, :, 2] * local[:, 2:3]
-    return moved + objects.translation[rows]  # type: ignore[no-any-return]
+    return apply(objects.rotation[rows], local) + objects.translation[rows]

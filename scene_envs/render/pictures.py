@@ -13,7 +13,6 @@ from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.render.stage import (
     Frame,
     Stage,
-    blur,
     contact_shade,
     frame_scene_type,
     get_stage,
@@ -42,6 +41,7 @@ _SUPERSAMPLING = 2
 _STYLES = ("picture", "semantic")
 _TABLE = 0.68
 """Radius (m) of the framing of a dim sum table, for which contact shading is tuned."""
+_PAGE, _INK = (255, 255, 255), (58, 62, 70)
 
 
 def render(
@@ -76,7 +76,8 @@ def render(
     scene_type = batch.scene_type
     if style not in _STYLES:
         raise unknown_name("render style", style, _STYLES)
-    default = camera or (scene_type.camera if style == "semantic" else _fitted_camera(scene_type, width, height))
+    size = {name: value for name, value in (("width", width), ("height", height)) if value is not None}
+    default = camera or (scene_type.camera if style == "semantic" else picture_camera(scene_type, **size))
     width, height = default.width if width is None else width, default.height if height is None else height
     if width < 1 or height < 1:
         raise InvalidInputError(f"an image needs at least 1 x 1 pixels, got width={width}, height={height}")
@@ -96,13 +97,6 @@ def render(
             view = camera or (default if seen is scene_type else picture_camera(seen, width, height))
             images[index] = _picture(stage, view, width, height, seen, marked[index])
     return images
-
-
-def _fitted_camera(scene_type: SceneType, width: int | None, height: int | None) -> Camera:
-    """The picture camera at the given size; None stands for the default size of a side."""
-    default = picture_camera(scene_type)
-    width, height = default.width if width is None else width, default.height if height is None else height
-    return picture_camera(scene_type, width, height)
 
 
 def _as_mask(highlight: torch.Tensor | NDArray[np.bool_] | None, batch: SceneBatch) -> NDArray[np.bool_]:
@@ -126,6 +120,8 @@ def _semantic(frame: Frame, categories: NDArray[np.int64], scene_type: SceneType
 def _picture(
     stage: Stage, camera: Camera, width: int, height: int, scene_type: SceneType, marked: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
+    from scipy.ndimage import uniform_filter
+
     scale = _SUPERSAMPLING
     framing = frame_scene_type(scene_type)
     frame = stage.look(camera, scale * width, scale * height, framing.to_light.tolist())
@@ -143,7 +139,7 @@ def _picture(
     normals = surface_normals(frame)
     shadow = soft_shadow(frame, light, normals, bias=1.3 * texel, lift=2.6 * texel)[..., None]
     reach = 0.04 * np.sqrt(framing.radius / _TABLE)
-    shade = blur(contact_shade(frame, normals, radius=reach), 2 * scale + 1)[..., None]
+    shade = uniform_filter(contact_shade(frame, normals, radius=reach), 2 * scale + 1)[..., None]
     towards = np.clip(2.0 * normals @ (frame.view[:3, :3] @ framing.to_light).astype(np.float32), 0.0, 1.0)[..., None]
     lit = color * (1.0 - _SHADOW * shadow * (0.4 + 0.6 * towards)) * (1.0 - np.minimum(1.25 * shade, 0.5))
     ramp = np.linspace(0.0, 1.0, scale * height, dtype=np.float32)[:, None, None]
@@ -151,9 +147,6 @@ def _picture(
     image = np.where((frame.slots >= 0)[..., None], lit, backdrop)
     small = image.reshape(height, scale, width, scale, 3).mean(axis=(1, 3))
     return np.rint(np.clip(small, 0.0, 255.0)).astype(np.uint8)
-
-
-_PAGE, _INK = (255, 255, 255), (58, 62, 70)
 
 
 def gallery(

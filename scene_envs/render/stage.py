@@ -1,4 +1,4 @@
-"""Stage: one PyBullet client that holds the bodies of a library and draws what a camera sees."""
+"""Stage, cameras and lighting: what PyBullet draws of a library's bodies, from where, and with which shadows."""
 
 from __future__ import annotations
 
@@ -24,6 +24,22 @@ from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_typ
 _AWAY = (0.0, 0.0, -1000.0)
 _CELL, _CELLS = 8, 32
 """The palette texture: 32 x 32 cells of 8 pixels, one per colour."""
+_SIDES = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_TOP = np.array([0.0, 0.0, 1.0])
+_RAYS = 24
+_FOV = 28.0
+_MARGIN = 0.05
+_LAMP_PIXELS = 512, 1024
+"""Resolution of the lamp's depth image for framings of a radius up to 2 m, and for larger ones."""
+_STRIDE = 2
+"""Normals and contact shades are computed for every ``_STRIDE``-th pixel of each axis, and repeated."""
+_TURNS = (np.arange(12) + 0.5) * np.pi * (3.0 - np.sqrt(5.0))
+_RADII = np.sqrt((np.arange(12) + 0.5) / 12)
+_SPIRAL = np.stack([_RADII * np.cos(_TURNS), _RADII * np.sin(_TURNS)], axis=1).astype(np.float32)
+"""(12, 2) points spread evenly over the unit disc (sunflower), at which shadows and contact shades are sampled."""
+_SOFTNESS = 1.8
+"""Radius of the filter of shadows, pixels of the lamp's image."""
+Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -68,10 +84,8 @@ class Stage:
     ) -> None:
         """Move bodies to the objects of one scene, and all others out of sight.
 
-        Args:
-            translations: (N, 3) translations, m.
-            quaternions: (N, 4) quaternions (w, x, y, z).
-            categories: (N,) categories; indices outside the library are empty slots.
+        Poses are translations (N, 3) m and quaternions (N, 4) (w, x, y, z). Slots whose category (N,) is outside the
+        library are empty.
         """
         bullet, used = self._bullet, [0] * len(self._bodies)
         highest = max((body for bodies in self._bodies for body in bodies), default=-1)
@@ -163,10 +177,8 @@ class Stage:
         )
 
 
-@cache
-def get_stage(names: tuple[str, ...], folders: tuple[str, ...] = ()) -> Stage:
-    """The stage of this process for the assets ``names``, which are looked up in ``folders`` first."""
-    return Stage(names, folders)
+get_stage = cache(Stage)
+"""The stage of this process for asset names in category order, which are looked up in the given folders first."""
 
 
 def make_palette(codes: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], int]:
@@ -196,11 +208,6 @@ def vertex_colors(asset: Asset) -> NDArray[np.uint8]:
 def _color_codes(asset: Asset) -> NDArray[np.int64]:
     rgb = vertex_colors(asset).astype(np.int64)
     return (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]
-
-
-_SIDES = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-_TOP = np.array([0.0, 0.0, 1.0])
-_RAYS = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,13 +266,7 @@ def scene_type_of_one(scene_type: SceneType, translations: Array, rotations: Arr
 
     A union of scene types has no fixed objects and the workspace of the largest type, in which a table would be tiny. A
     scene with one welded object is framed as if this object were fixed there; any other scene is framed as
-    ``scene_type``.
-
-    Args:
-        scene_type: Scene type of the scene.
-        translations: (N, 3) translations, m.
-        rotations: (N, 3, 3) rotations.
-        categories: (N,) int64; the number of assets is the category of empty slots.
+    ``scene_type``. Poses are (N, 3) m and (N, 3, 3); empty slots have the number of assets as category (N,).
     """
     names = np.array([*scene_type.assets, ""])[categories]
     supports = np.flatnonzero(np.isin(names, scene_type.welded))
@@ -289,14 +290,10 @@ def scene_type_of_one(scene_type: SceneType, translations: Array, rotations: Arr
 
 
 def fit_camera(points: Array, to_camera: Array, fov_y: float, aspect: float, margin: float) -> tuple[Array, Array]:
-    """Position and target (m) of the nearest camera without roll that sees all points.
+    """Position and target (m) of the nearest camera without roll that sees all points (P, 3) m.
 
-    Args:
-        points: (P, 3) points, m.
-        to_camera: (3,) unit vector from the scene to the camera; not vertical.
-        fov_y: Vertical field of view, degrees.
-        aspect: Ratio of width to height.
-        margin: Share of the half image that stays free at each border.
+    ``to_camera`` (3,) is a unit vector from the scene to the camera, not vertical; ``fov_y`` the vertical field of view
+    in degrees; ``aspect`` width to height; ``margin`` the share of the half image that stays free at each border.
     """
     right = np.cross(_TOP, to_camera)
     right /= np.linalg.norm(right)
@@ -362,12 +359,6 @@ def _direction(azimuth: float, elevation: float) -> Array:
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
-_FOV = 28.0
-_MARGIN = 0.05
-_LAMP_PIXELS = 512, 1024
-"""Resolution of the lamp's depth image for framings of a radius up to 2 m, and for larger ones."""
-
-
 def picture_camera(scene_type: str | SceneType, width: int = 480, height: int = 360) -> Camera:
     """The three-quarter view of pictures without a given camera.
 
@@ -404,9 +395,6 @@ def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
     return (float(vector[0]), float(vector[1]), float(vector[2]))
 
 
-Image = NDArray[np.float32]
-
-
 def camera_points(frame: Frame) -> Image:
     """(H, W, 3): the visible point of each pixel in the camera frame (x right, y up, z backward), m."""
     height, width = frame.depth.shape
@@ -416,39 +404,24 @@ def camera_points(frame: Frame) -> Image:
     return np.stack([x[None, :] * depth, y[:, None] * depth, -depth], axis=-1).astype(np.float32)
 
 
-def surface_normals(frame: Frame, *, stride: int = 2) -> Image:
-    """(H, W, 3): unit normals in the camera frame, facing the camera; those of every ``stride``-th pixel are repeated.
+def surface_normals(frame: Frame) -> Image:
+    """(H, W, 3): unit normals in the camera frame, facing the camera; those of every second pixel are repeated.
 
     Along each axis the difference to the nearer neighbour is taken, so that edges of objects stay sharp.
     """
-    points = camera_points(frame)[::stride, ::stride]
+    points = camera_points(frame)[::_STRIDE, ::_STRIDE]
     along = [_shorter(np.diff(points, axis=axis), axis) for axis in (1, 0)]
     normals = np.cross(along[1], along[0])
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     facing = np.where(np.einsum("hwk,hwk->hw", normals, points) > 0, np.float32(-1.0), np.float32(1.0))
-    return _enlarge((normals * facing[..., None]).astype(np.float32), stride, frame.depth.shape)
+    return _enlarge((normals * facing[..., None]).astype(np.float32), frame.depth.shape)
 
 
-def soft_shadow(
-    frame: Frame,
-    light: Frame,
-    normals: Image,
-    *,
-    bias: float = 0.004,
-    lift: float = 0.008,
-    softness: float = 1.8,
-    taps: int = 12,
-) -> Image:
+def soft_shadow(frame: Frame, light: Frame, normals: Image, *, bias: float = 0.004, lift: float = 0.008) -> Image:
     """(H, W) in 0..1: the part of the light that nearer objects hide, by percentage-closer filtering.
 
-    Args:
-        frame: Frame of the camera.
-        light: Frame of the same scene seen from the light.
-        normals: (H, W, 3) normals from :func:`surface_normals`.
-        bias: Smallest difference in distance from the light (m) between an occluder and the point.
-        lift: Distance (m) by which points are raised off their surface, so that no surface shadows itself.
-        softness: Radius of the filter, pixels of ``light``.
-        taps: Number of samples of the filter.
+    ``light`` is the frame of the same scene seen from the light. An occluder is nearer to it than the point by at least
+    ``bias`` (m). Points are raised off their surface by ``lift`` (m), so that no surface shadows itself.
     """
     seen = np.isfinite(frame.depth)
     to_light = (light.view @ np.linalg.inv(frame.view)).astype(np.float32)
@@ -459,43 +432,36 @@ def soft_shadow(
     row = (1.0 - points[:, 1] / distance * np.float32(light.focal[1])) * (0.5 * height)
     nearest = light.depth.ravel()
     hidden = np.zeros(len(points), dtype=np.float32)
-    for dx, dy in _spiral(taps) * softness:
+    for dx, dy in _SPIRAL * _SOFTNESS:
         index = _pixel(row + dy, height) * width + _pixel(column + dx, width)
         hidden += nearest[index] < distance - bias
     shadow = np.zeros(frame.depth.shape, dtype=np.float32)
-    shadow[seen] = hidden / taps
+    shadow[seen] = hidden / len(_SPIRAL)
     return shadow
 
 
-def contact_shade(frame: Frame, normals: Image, *, radius: float = 0.04, taps: int = 12, stride: int = 2) -> Image:
+def contact_shade(frame: Frame, normals: Image, *, radius: float = 0.04) -> Image:
     """(H, W) in 0..1: ambient occlusion of each point by its surroundings within ``radius`` m.
 
-    Computed for every ``stride``-th pixel of each axis and repeated; callers blur the result.
+    Computed for every second pixel of each axis and repeated; callers blur the result.
     """
-    grid = camera_points(frame)[::stride, ::stride]
+    grid = camera_points(frame)[::_STRIDE, ::_STRIDE]
     height, width = grid.shape[:2]
     rows, columns = np.nonzero(grid[..., 2] < 0)
     surroundings = grid.reshape(-1, 3)
-    points, facing = grid[rows, columns], normals[::stride, ::stride][rows, columns]
+    points, facing = grid[rows, columns], normals[::_STRIDE, ::_STRIDE][rows, columns]
     reach_x = (0.5 * width * frame.focal[0] * radius / -points[:, 2]).astype(np.float32)
     reach_y = (0.5 * height * frame.focal[1] * radius / -points[:, 2]).astype(np.float32)
     closed = np.zeros(len(points), dtype=np.float32)
-    for dx, dy in _spiral(taps):
+    for dx, dy in _SPIRAL:
         index = _pixel(rows + 0.5 + dy * reach_y, height) * width + _pixel(columns + 0.5 + dx * reach_x, width)
         offset = surroundings[index] - points
         square = np.einsum("nk,nk->n", offset, offset) + np.float32(1e-8)
         rise = np.einsum("nk,nk->n", offset, facing) / np.sqrt(square)
         closed += np.maximum(rise - np.float32(0.12), 0.0) * (square < 4.0 * radius**2)
     shade = np.zeros((height, width), dtype=np.float32)
-    shade[rows, columns] = closed / taps
-    return _enlarge(shade, stride, frame.depth.shape)
-
-
-def blur(image: Image, size: int) -> Image:
-    """(H, W) averaged over windows of ``size`` pixels."""
-    from scipy.ndimage import uniform_filter
-
-    return np.asarray(uniform_filter(image, size), dtype=np.float32)
+    shade[rows, columns] = closed / len(_SPIRAL)
+    return _enlarge(shade, frame.depth.shape)
 
 
 def _pixel(position: NDArray[np.float32], size: int) -> NDArray[np.int32]:
@@ -503,8 +469,8 @@ def _pixel(position: NDArray[np.float32], size: int) -> NDArray[np.int32]:
     return np.clip(position, 0, size - 1).astype(np.int32)
 
 
-def _enlarge(image: Image, stride: int, shape: tuple[int, ...]) -> Image:
-    return image.repeat(stride, axis=0).repeat(stride, axis=1)[: shape[0], : shape[1]]
+def _enlarge(image: Image, shape: tuple[int, ...]) -> Image:
+    return image.repeat(_STRIDE, axis=0).repeat(_STRIDE, axis=1)[: shape[0], : shape[1]]
 
 
 def _shorter(steps: Image, axis: int) -> Image:
@@ -513,10 +479,3 @@ def _shorter(steps: Image, axis: int) -> Image:
     backward, forward = np.concatenate([first, steps], axis=axis), np.concatenate([steps, last], axis=axis)
     nearer = np.abs(backward[..., 2:]) <= np.abs(forward[..., 2:])
     return np.where(nearer, backward, forward)
-
-
-def _spiral(taps: int) -> NDArray[np.float32]:
-    """(taps, 2): points spread evenly over the unit disc (sunflower)."""
-    index = np.arange(taps) + 0.5
-    radius, angle = np.sqrt(index / taps), index * np.pi * (3.0 - np.sqrt(5.0))
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1).astype(np.float32)

@@ -75,6 +75,9 @@ def viewer_page(
 
     A page that shows it in a frame can call ``sceneViewer.showScene(k)`` of the frame's window to show scene k.
     """
+    from jinja2.utils import htmlsafe_json_dumps
+    from markupsafe import Markup
+
     if len(batch) == 0:
         raise InvalidInputError("a viewer needs at least one scene; the batch is empty")
     if captions is None:
@@ -82,18 +85,12 @@ def viewer_page(
     if len(captions) != len(batch):
         raise InvalidInputError(f"{len(batch)} scenes need {len(batch)} captions, got {len(captions)}")
     title = batch.scene_type.name.replace("_", " ") if title is None else title
-    return _page(title, {**_viewer_data(batch, captions), "refresh": refresh})
-
-
-def _page(title: str, data: dict[str, Any]) -> str:
-    """The filled-in template; the data is escaped, so that it cannot end the HTML element that holds it."""
-    from jinja2.utils import htmlsafe_json_dumps
-    from markupsafe import Markup
-
+    data = {**_viewer_data(batch, captions), "refresh": refresh}
     return page_template(_WEB, "viewer.html").render(
         title=title,
         style=Markup(page_part(_WEB, "viewer.css")),
         scripts=Markup("\n".join(page_part(_WEB, name) for name in _SCRIPTS)),
+        # escaped, so that it cannot end the HTML element that holds it
         data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
     )
 

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
 from scene_envs.export import AssetFiles, export, list_formats, register_format
 from scene_envs.export import api as formats
-from scene_envs.export.api import get_format
 from scene_envs.export.placed import (
     Palette,
     angle_axis,
@@ -250,7 +249,7 @@ def test_a_format_of_ones_own_gets_poses_and_meshes(tmp_path):
         return path
 
     assert "height_list" in list_formats()
-    assert get_format("height_list").summary == "heights"
+    assert formats._FORMATS["height_list"].summary == "heights"
     report = export(laid_scene(), tmp_path, ["height_list"])
     assert "steamer_lid_0 0.182 14" in report.scenes[0]["height_list"].read_text()
     with pytest.raises(InvalidInputError, match="letters, digits"):

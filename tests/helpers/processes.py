@@ -50,7 +50,7 @@ def in_processes(function: Callable[..., None], *arguments: Any, count: int = 2)
         free.bind(("127.0.0.1", 0))
         address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": str(count)}
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__, "scene_envs.assets.built_in", "matplotlib.figure", "scipy.stats"])
+    context.set_forkserver_preload([__name__, "scene_envs.assets.library", "matplotlib.figure", "scipy.stats"])
     processes = [
         context.Process(target=_launched, args=({"RANK": str(rank), **address}, function, arguments))
         for rank in range(count)

@@ -1,4 +1,4 @@
-"""Import of one file as an asset: reading, scaling, decomposition, mass, base."""
+"""Import of one file as an asset: its entry in ``library.yaml``, the body it becomes, and the report."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import Asset, ConvexPart, bounds_of, regular_plural
@@ -29,7 +27,6 @@ from scene_envs.assets.importing.mesh_files import (
 )
 from scene_envs.assets.importing.robot_files import read_sdf, read_urdf
 from scene_envs.assets.importing.solids import (
-    METHODS,
     Method,
     collision_of,
     enclosing_hull,
@@ -37,7 +34,7 @@ from scene_envs.assets.importing.solids import (
     thickness,
     visual_of,
 )
-from scene_envs.assets.shapes import MassProperties, join, mass_properties
+from scene_envs.assets.shapes import MassProperties, join, mass_properties, moved
 from scene_envs.errors import CorruptFileError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -48,33 +45,38 @@ YAML_NAMES = ("library.yaml", "library.yml")
 SUFFIXES = (".urdf", ".sdf", *MESH_SUFFIXES)
 """Files that can become assets."""
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
-AXES: tuple[Axis, ...] = ("x", "y", "z", "-x", "-y", "-z")
 Base = Literal["bottom", "origin"]
-BASES: tuple[Base, ...] = ("bottom", "origin")
+_TEXTS = ("file", "name", "display_name", "plural")
+_NUMBERS = ("scale", "density", "mass", "concavity")
+_CHOICES = {key: get_args(kind) for key, kind in (("up", Axis), ("base", Base), ("decomposition", Method))}
+DEFAULT_DENSITY = 500.0
+"""Density (kg/m^3) used where neither the file nor the user gives one: wood, or a ceramic vessel with its air."""
+_POSSIBLE = (1.0, 23_000.0)
+"""Possible densities, kg/m^3, from air to osmium."""
+_FACTOR = 10.0
+"""Largest factor between a moment of inertia and that of the same shape filled evenly."""
+_CONVEX = 0.01
+"""Depth below the hull, as a fraction of the diagonal, up to which a body counts as convex."""
+_MAX_CONVEX = 2e-3
+"""Upper limit (m) of that depth."""
+_THIN = 3e-3
+"""Parts thinner than this (m) get a note: the collision margins of physics engines take up much of them."""
+_MANY_PARTS, _MANY_TRIANGLES = 64, 200_000
+_UNLIKE = 0.01
+"""Difference (m) between the bounding boxes of visual and collision geometry that is worth a note."""
+_SMALL, _LARGE = 2e-3, 20.0
+"""Smallest and largest plausible diagonal (m); beyond them the file is probably not in metres."""
 
 
 @dataclass(frozen=True)
-class AssetNames:
-    """File and names of an asset.
+class AssetEntry:
+    """One asset of a library: its file, its names and how its file becomes a body.
 
     Attributes:
         file: Path relative to the folder.
         name: Identifier; the stem of the file by default.
         display_name: Name in prompts; the identifier with spaces by default.
         plural: Plural of the display name; the regular one by default.
-    """
-
-    file: str
-    name: str = ""
-    display_name: str = ""
-    plural: str = ""
-
-
-@dataclass(frozen=True)
-class AssetEntry(AssetNames):
-    """One asset of a library: its names and how its file becomes a body.
-
-    Attributes:
         scale: Factor on all lengths; a file in millimetres needs 0.001.
         density: Density (kg/m^3) of the evenly filled shape.
         mass: Mass, kg.
@@ -86,6 +88,10 @@ class AssetEntry(AssetNames):
         concavity: CoACD's threshold, 0.01 (many parts) to 1 (one).
     """
 
+    file: str
+    name: str = ""
+    display_name: str = ""
+    plural: str = ""
     scale: float = 1.0
     density: float | None = None
     mass: float | None = None
@@ -95,11 +101,6 @@ class AssetEntry(AssetNames):
     base: Base = "bottom"
     decomposition: Method = "auto"
     concavity: float = 0.05
-
-
-_TEXTS = ("file", "name", "display_name", "plural")
-_NUMBERS = ("scale", "density", "mass", "concavity")
-_CHOICES: Mapping[str, tuple[str, ...]] = {"up": AXES, "base": BASES, "decomposition": METHODS}
 
 
 def read_entries(path: Path) -> list[AssetEntry]:
@@ -149,7 +150,6 @@ def _named(values: dict[str, Any]) -> AssetEntry:
     values.setdefault("name", "_".join(file.stem.split()))
     values.setdefault("display_name", " ".join(values["name"].replace("_", " ").split()) or values["name"])
     values.setdefault("plural", regular_plural(values["display_name"]))
-    values.setdefault("up", "z")
     return AssetEntry(**values)
 
 
@@ -212,14 +212,6 @@ def _color(value: Any, where: str) -> Color:
     raise InvalidInputError(f"{where}: color must be [r, g, b] in 0..255 or '#rrggbb', got {value!r}")
 
 
-DEFAULT_DENSITY = 500.0
-"""Density (kg/m^3) used where neither the file nor the user gives one: wood, or a ceramic vessel with its air."""
-_POSSIBLE = (1.0, 23_000.0)
-"""Possible densities, kg/m^3, from air to osmium."""
-_FACTOR = 10.0
-"""Largest factor between a moment of inertia and that of the same shape filled evenly."""
-
-
 class Weight(NamedTuple):
     """Mass properties of an asset, with remarks for the report."""
 
@@ -229,44 +221,28 @@ class Weight(NamedTuple):
 
 
 def weigh(
-    given: Inertial | None,
-    parts: Sequence[ConvexPart],
-    volume: float,
-    *,
-    mass: float | None = None,
-    density: float | None = None,
+    given: Inertial | None, parts: Sequence[ConvexPart], volume: float, mass: float | None, density: float | None
 ) -> Weight:
     """Mass properties of an asset.
 
-    The file's properties are kept when they can belong to a body of this shape. A user's ``mass`` keeps the
-    file's distribution of mass; a user's ``density`` fills the shape evenly.
-
-    Args:
-        given: Inertial of the file; None when the file has none.
-        parts: Fine convex parts, m.
-        volume: Volume of the shape, m^3.
-        mass: The user's mass, kg.
-        density: The user's density, kg/m^3.
+    The properties ``given`` by the file are kept when they can belong to a body of these fine parts and this ``volume``
+    (m^3). A user's ``mass`` (kg) keeps the file's distribution of mass; a user's ``density`` (kg/m^3) fills the shape
+    evenly.
     """
     if density is not None:
         return Weight(mass_properties(parts, density * volume), (), ())
     if given is None or given.mass <= 0:
-        known = density_note = ""
+        known = "inertia computed from the shape"
         if mass is None:
-            known, density_note = "mass and inertia", f" at {DEFAULT_DENSITY:g} kg/m^3"
-            mass = DEFAULT_DENSITY * volume
-        else:
-            known = "inertia"
+            known, mass = f"mass and {known} at {DEFAULT_DENSITY:g} kg/m^3", DEFAULT_DENSITY * volume
         why = "the file gives none" if given is None else f"the file gives a mass of {given.mass:g} kg"
-        return Weight(mass_properties(parts, mass), (f"{known} computed from the shape{density_note}: {why}",), ())
+        return Weight(mass_properties(parts, mass), (f"{known}: {why}",), ())
     if mass is None:
-        low, high = _POSSIBLE
         found = given.mass / volume
-        if not low <= found <= high:
-            mass = DEFAULT_DENSITY * volume
+        if not _POSSIBLE[0] <= found <= _POSSIBLE[1]:
             reason = f"the file's {given.mass:g} kg would be {found:.3g} kg/m^3"
             text = f"mass and inertia recomputed at {DEFAULT_DENSITY:g} kg/m^3: {reason}"
-            return Weight(mass_properties(parts, mass), (), (text,))
+            return Weight(mass_properties(parts, DEFAULT_DENSITY * volume), (), (text,))
         mass = given.mass
     computed = mass_properties(parts, mass)
     inertia = given.inertia * (mass / given.mass)
@@ -361,19 +337,6 @@ class ImportReport:
         return "\n".join([f"{self.folder}: {len(self.assets)} assets", *self.notes, *map(str, self.assets)])
 
 
-_CONVEX = 0.01
-"""Depth below the hull, as a fraction of the diagonal, up to which a body counts as convex."""
-_MAX_CONVEX = 2e-3
-"""Upper limit (m) of that depth."""
-_THIN = 3e-3
-"""Parts thinner than this (m) get a note: the collision margins of physics engines take up much of them."""
-_MANY_PARTS, _MANY_TRIANGLES = 64, 200_000
-_UNLIKE = 0.01
-"""Difference (m) between the bounding boxes of visual and collision geometry that is worth a note."""
-_SMALL, _LARGE = 2e-3, 20.0
-"""Smallest and largest plausible diagonal (m); beyond them the file is probably not in metres."""
-
-
 def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     """The asset that ``entry`` makes of the file at ``path``, and its import report.
 
@@ -397,15 +360,17 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     if entry.welded is None and (entry.mass is not None or entry.density is not None):
         static = False
     given = merged_inertial(model.inertials) if model.inertials else None
-    weight = weigh(given, parts, volume, mass=entry.mass, density=entry.density)
+    weight = weigh(given, parts, volume, entry.mass, entry.density)
     properties = mass_properties(parts, 0.0) if static else weight.properties
     if not static:
         notes += weight.notes
         warnings += weight.warnings
     visual = join(*(mesh for shape in model.visuals or shapes for mesh in visual_of(shape, entry.color)))
     shift = _shift(parts, entry, visual if static else None)
-    notes += _unlike(visual, parts, size)
-    fine = tuple(ConvexPart(_clean(part.vertices + shift), part.faces) for part in parts)
+    apart = float(np.abs(np.asarray(visual.bounds) - bounds_of(parts)).max())
+    if apart > max(_UNLIKE, 0.05 * size):
+        notes.append(f"the boxes of visual and collision geometry differ by up to {apart:.2g} m")
+    fine = tuple(_shifted(part, shift) for part in parts)
     if len(visual.faces) > _MANY_TRIANGLES:
         notes.append(f"{len(visual.faces)} triangles to draw; pictures will be slow")
     asset = Asset(
@@ -415,7 +380,7 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
         mass=properties.mass,
         center_of_mass=properties.center_of_mass + shift,
         inertia=properties.inertia,
-        visual=_moved(visual, shift),
+        visual=moved(visual, np.eye(3), shift),
         fine=fine,
         coarse=fine if len(fine) == 1 else (enclosing_hull(fine),),
         color=entry.color or (128, 128, 128),
@@ -423,10 +388,8 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     )
     x, y, z = (shift + 0.0).tolist()
     density = 0.0 if static else properties.mass / volume
-    report = AssetReport(
-        entry.name, path, properties.mass, density, len(fine), (x, y, z), tuple(notes), tuple(warnings)
-    )  # fmt: skip
-    return asset, report
+    remarks = tuple(notes), tuple(warnings)
+    return asset, AssetReport(entry.name, path, properties.mass, density, len(fine), (x, y, z), *remarks)
 
 
 def _read(path: Path) -> Model:
@@ -454,9 +417,8 @@ def _scaled(model: Model, entry: AssetEntry) -> Model:
     notes = model.notes
     if scale != 1.0 and any(i.mass > 0 for i in model.inertials) and entry.mass is None and entry.density is None:
         notes = (*notes, f"mass scaled by {scale:g} cubed")
-    return Model(
-        tuple(map(shape, model.visuals)), tuple(map(shape, model.collisions)), inertials, model.static, notes
-    )  # fmt: skip
+    visuals, collisions = (tuple(map(shape, some)) for some in (model.visuals, model.collisions))
+    return Model(visuals, collisions, inertials, model.static, notes)
 
 
 def _upright(up: Axis) -> Array:
@@ -518,14 +480,6 @@ def _collide(
     return parts, volume
 
 
-def _unlike(visual: trimesh.Trimesh, parts: Sequence[ConvexPart], size: float) -> list[str]:
-    """A note when visual and collision geometry have different bounding boxes."""
-    apart = float(np.abs(np.asarray(visual.bounds) - bounds_of(parts)).max())
-    if apart <= max(_UNLIKE, 0.05 * size):
-        return []
-    return [f"the boxes of visual and collision geometry differ by up to {apart:.2g} m"]
-
-
 def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trimesh | None) -> Array:
     """(3,) m: position of the file's origin in the asset frame; the box includes ``visual`` when it is given."""
     if entry.base == "origin":
@@ -536,29 +490,11 @@ def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trime
     return 0.0 - np.array([0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), low[2]])
 
 
-def _clean(vertices: Array) -> Array:
-    """The vertices, with heights that are 0 up to rounding set to exactly 0."""
+def _shifted(part: ConvexPart, shift: Array) -> ConvexPart:
+    """The part in the asset frame; heights that are 0 up to rounding become exactly 0."""
+    vertices = part.vertices + shift
     vertices[np.abs(vertices[:, 2]) < 1e-9, 2] = 0.0
-    return vertices
-
-
-def _moved(mesh: trimesh.Trimesh, shift: Array) -> trimesh.Trimesh:
-    import trimesh
-
-    return trimesh.Trimesh(
-        vertices=mesh.vertices + shift,
-        faces=mesh.faces,
-        vertex_normals=mesh.vertex_normals,
-        vertex_colors=mesh.visual.vertex_colors,  # type: ignore[union-attr]
-        process=False,
-    )
-
-
-@cache
-def _candidates() -> NDArray[np.float64]:
-    tones = [(s, v) for v in (0.85, 0.6, 0.4) for s in (0.85, 0.55)]
-    colors = [colorsys.hsv_to_rgb(hue / 36.0, s, v) for s, v in tones for hue in range(36)]
-    return np.rint(255.0 * np.array(colors))
+    return ConvexPart(vertices, part.faces)
 
 
 def distinct_colors(count: int, taken: Iterable[Color] = ()) -> list[Color]:
@@ -569,7 +505,8 @@ def distinct_colors(count: int, taken: Iterable[Color] = ()) -> list[Color]:
     >>> bool(gaps.min() > 60)
     True
     """
-    pool = _candidates()
+    tones = [(s, v) for v in (0.85, 0.6, 0.4) for s in (0.85, 0.55)]
+    pool = np.rint(255.0 * np.array([colorsys.hsv_to_rgb(hue / 36.0, s, v) for s, v in tones for hue in range(36)]))
     gaps = np.full(len(pool), np.inf)
     for color in ((255, 255, 255), *taken):
         gaps = np.minimum(gaps, np.linalg.norm(pool - np.asarray(color), axis=1))

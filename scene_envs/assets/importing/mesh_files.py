@@ -1,4 +1,4 @@
-"""Reader of mesh files: checked triangles with a colour per corner."""
+"""Model files as data: shapes and inertials, meshes with a colour per corner, and checked numbers of XML files."""
 
 from __future__ import annotations
 
@@ -24,6 +24,26 @@ if TYPE_CHECKING:
 
 Color = tuple[int, int, int]
 Kind = Literal["mesh", "box", "cylinder", "sphere", "capsule", "ellipsoid"]
+MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+"""Mesh files that can be read."""
+_GREY: Color = (176, 176, 170)
+_UNSET = (102, 102, 102)
+"""Colour that trimesh gives a mesh with texture coordinates and no material."""
+_SMOOTH = float(np.cos(np.radians(40.0)))
+"""Faces that meet at less than 40 degrees are shaded as one curved surface."""
+_MAX_SMOOTHED = 100_000
+"""Largest number of triangles of a mesh whose corners are smoothed."""
+_FINE_TEXTURE, _TEXTURE_COLORS = 500, 32
+"""Smallest number of triangles that a textured mesh is cut into, and largest number of its colours."""
+_MAX_PIXELS = 8192 * 8192
+"""Largest number of pixels of a texture."""
+_SAMPLES = np.array(
+    [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)], dtype=np.float64
+) / 4.0  # fmt: skip
+"""Barycentric points (15, 3) at which a texture is read to colour a triangle."""
+_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_PREFIXED = re.compile(rb"(</?)([A-Za-z_][\w.-]*):([A-Za-z_][\w.-]*)")
+"""An element with a namespace prefix, such as <drake:declare_convex/>."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +98,8 @@ def from_roll_pitch_yaw(angles: Array) -> Array:
 def moved_inertial(pose: Array, inertial: Inertial) -> Inertial:
     """The inertial of a link in the frame that ``pose`` (4, 4) maps to."""
     turn = pose[:3, :3]
-    return Inertial(
-        inertial.mass, turn @ inertial.center_of_mass + pose[:3, 3], turn @ inertial.inertia @ turn.T
-    )  # fmt: skip
+    center = turn @ inertial.center_of_mass + pose[:3, 3]
+    return Inertial(inertial.mass, center, turn @ inertial.inertia @ turn.T)
 
 
 def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
@@ -93,27 +112,6 @@ def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
         arm = inertial.center_of_mass - center
         total += inertial.inertia + inertial.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     return Inertial(mass, center, total)
-
-
-MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-"""Mesh files that can be read."""
-
-_GREY: Color = (176, 176, 170)
-_UNSET = (102, 102, 102)
-"""Colour that trimesh gives a mesh with texture coordinates and no material."""
-_SMOOTH = float(np.cos(np.radians(40.0)))
-"""Faces that meet at less than 40 degrees are shaded as one curved surface."""
-_MAX_SMOOTHED = 100_000
-"""Largest number of triangles of a mesh whose corners are smoothed."""
-_FINE_TEXTURE, _TEXTURE_COLORS = 500, 32
-"""Smallest number of triangles that a textured mesh is cut into, and largest number of its colours."""
-_MAX_PIXELS = 8192 * 8192
-"""Largest number of pixels of a texture."""
-_SAMPLES = np.array(
-    [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)], dtype=np.float64
-) / 4.0  # fmt: skip
-"""Barycentric points (15, 3) at which a texture is read to colour a triangle."""
-_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def read_mesh(path: Path) -> list[trimesh.Trimesh]:
@@ -339,16 +337,10 @@ def _corner_normals(mesh: trimesh.Trimesh) -> Array:
     return smooth.reshape(-1, 3, 3)
 
 
-_PREFIXED = re.compile(rb"(</?)([A-Za-z_][\w.-]*):([A-Za-z_][\w.-]*)")
-"""An element with a namespace prefix, such as <drake:declare_convex/>."""
-
-
 def read_xml(path: Path) -> Element:
     """The root element of an XML file; prefixes that are never declared are tolerated.
 
-    Raises:
-        CorruptFileError: the file cannot be read or is not XML; the line is named.
-        InvalidInputError: the file is larger than imports may be.
+    Raises CorruptFileError, with the line, for a file that cannot be read or is no XML, and as :func:`check_file` does.
     """
     check_file(path)
     try:
@@ -367,11 +359,7 @@ def read_xml(path: Path) -> Element:
 
 
 def numbers(text: str | None, count: int, path: Path, where: str, default: tuple[float, ...] | None = None) -> Array:
-    """``count`` finite numbers from text; ``default`` when there is none.
-
-    Raises:
-        CorruptFileError: the text is anything else; file and place are named.
-    """
+    """``count`` finite numbers from text, ``default`` when there is none; CorruptFileError for anything else."""
     if text is None or not text.strip():
         if default is None:
             raise CorruptFileError(f"{path}: {where} is missing; it needs {count} number{'s' if count > 1 else ''}")

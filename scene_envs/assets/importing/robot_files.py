@@ -1,4 +1,4 @@
-"""SDF reader: the links of one model merged at zero joint positions."""
+"""Readers of SDF and URDF: the links of one model merged at zero joint positions."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from scene_envs.assets.importing.mesh_files import (
 from scene_envs.errors import CorruptFileError, InvalidInputError
 
 _RADII = {"cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sphere": ("radius",)}
+_ZERO = (0.0, 0.0, 0.0)
 
 
 def read_sdf(path: Path) -> Model:
     """The model in an SDF file, in the model frame; the pose of the model in its world is ignored.
 
-    Raises:
-        CorruptFileError: not an SDF, or one that contradicts itself; the place is named.
-        InvalidInputError: several models, an include, or a mesh that does not exist.
+    Raises CorruptFileError for a file that is no SDF or contradicts itself, and InvalidInputError for several models,
+    an include, or a mesh that does not exist.
     """
     model = _only_model(path)
     links = {link.get("name", ""): link for link in model.findall("link")}
@@ -156,9 +156,8 @@ def _sdf_shape(element: Element, pose: Array, path: Path, where: str) -> Shape |
     if kind.tag in _RADII:
         size = [positive(kind.findtext(key), 1, path, f"{kind.tag} {key} of {where}")[0] for key in _RADII[kind.tag]]
         return Shape(kind.tag, tuple(size), pose, where, None, color)  # type: ignore[arg-type]
-    raise CorruptFileError(
-        f"{path}: {where} is a <{kind.tag}>; known are mesh, box, cylinder, sphere, capsule and ellipsoid"
-    )  # fmt: skip
+    known = "mesh, box, cylinder, sphere, capsule and ellipsoid"
+    raise CorruptFileError(f"{path}: {where} is a <{kind.tag}>; known are {known}")
 
 
 def _sdf_inertial(element: Element, path: Path, where: str) -> Inertial:
@@ -175,17 +174,11 @@ def _flag(text: str | None) -> bool:
     return (text or "").strip().lower() in ("1", "true")
 
 
-_ZERO = (0.0, 0.0, 0.0)
-
-
 def read_urdf(path: Path) -> Model:
-    """The model in a URDF file, in the frame of its root link.
+    """The model in a URDF file, in the frame of its root link; movable joints are frozen at zero and listed in a note.
 
-    Movable joints are frozen at zero and listed in a note.
-
-    Raises:
-        CorruptFileError: not a URDF, or one that contradicts itself; the place is named.
-        InvalidInputError: a mesh it refers to does not exist.
+    Raises CorruptFileError for a file that is no URDF or contradicts itself, and InvalidInputError for a mesh that does
+    not exist.
     """
     robot = read_xml(path)
     if robot.tag != "robot":
@@ -199,13 +192,13 @@ def read_urdf(path: Path) -> Model:
         for material in link.findall("visual/material"):
             if material.find("color") is not None:
                 materials[material.get("name", "")] = _own_color(material, path)
-    visuals, collisions, inertials = [], [], []
+    visuals: list[Shape] = []
+    collisions: list[Shape] = []
+    inertials = []
     for name, link in links.items():
-        for index, element in enumerate(link.findall("visual"), start=1):
-            where = f"visual {index} of link {name!r}"
-            visuals.append(_urdf_shape(element, poses[name], materials, path, where))
-        for index, element in enumerate(link.findall("collision"), start=1):
-            collisions.append(_urdf_shape(element, poses[name], {}, path, f"collision {index} of link {name!r}"))
+        for tag, shapes, known in (("visual", visuals, materials), ("collision", collisions, {})):
+            for index, element in enumerate(link.findall(tag), start=1):
+                shapes.append(_urdf_shape(element, poses[name], known, path, f"{tag} {index} of link {name!r}"))
         inertial = link.find("inertial")
         if inertial is not None:
             inertials.append(moved_inertial(poses[name], _urdf_inertial(inertial, path, f"inertial of link {name!r}")))
@@ -281,18 +274,10 @@ def _urdf_shape(element: Element, link: Array, materials: dict[str, Color | None
         return Shape("mesh", sizes, pose, where, find_mesh(filename, path, where), color, convex)
     if kind.tag == "box":
         return Shape("box", positive(kind.get("size"), 3, path, f"box size of {where}"), pose, where, None, color)
-    if kind.tag == "sphere":
-        radius = positive(kind.get("radius"), 1, path, f"sphere radius of {where}")
-        return Shape("sphere", radius, pose, where, None, color)
-    if kind.tag in ("cylinder", "capsule"):
-        sizes = (
-            *positive(kind.get("radius"), 1, path, f"{kind.tag} radius of {where}"),
-            *positive(kind.get("length"), 1, path, f"{kind.tag} length of {where}"),
-        )
-        return Shape("capsule" if kind.tag == "capsule" else "cylinder", sizes, pose, where, None, color)
-    raise CorruptFileError(
-        f"{path}: {where} is a <{kind.tag}>; known are mesh, box, cylinder, sphere and capsule"
-    )  # fmt: skip
+    if kind.tag in _RADII:
+        sizes = tuple(positive(kind.get(k), 1, path, f"{kind.tag} {k} of {where}")[0] for k in _RADII[kind.tag])
+        return Shape(kind.tag, sizes, pose, where, None, color)  # type: ignore[arg-type]
+    raise CorruptFileError(f"{path}: {where} is a <{kind.tag}>; known are mesh, box, cylinder, sphere and capsule")
 
 
 def _urdf_inertial(element: Element, path: Path, where: str) -> Inertial:

@@ -35,6 +35,18 @@ _COARSE_CORNERS = 16
 """Corners of the inner hull whose faces are moved outward to make an enclosing hull."""
 _DIRECTIONS = np.array(list(np.ndindex(3, 3, 3)), dtype=np.float64) - 1.0
 """Directions to the 26 neighbours of a cell, and the zero vector."""
+Method = Literal["auto", "coacd", "convex"]
+_LOGGER = logging.getLogger(__name__)
+_VERSION = 2
+"""Version of the format on disk."""
+_SNAP_DISTANCE = 0.015
+"""Largest distance from the true surface, relative to the size of the body, at which corners are moved onto it. CoACD
+rebuilds surfaces that are not closed on a grid; moving the corners keeps flat faces flat."""
+_MAX_BODIES = 128
+"""Largest number of bodies of one mesh that are decomposed one by one."""
+_SEGMENTS = 16
+_CAP = np.radians(15.0)
+"""Half angle of the flat faces at the poles of a ball, on which it can stand."""
 
 
 def few_cornered_hull(points: Array, tolerance: float, corners: int = MAX_CORNERS) -> tuple[ConvexPart, float]:
@@ -108,18 +120,6 @@ def has_volume(points: Array) -> bool:
     return bool(spread[2] > 1e-6 * max(spread[0], 1e-300))
 
 
-Method = Literal["auto", "coacd", "convex"]
-METHODS: tuple[Method, ...] = ("auto", "coacd", "convex")
-_LOGGER = logging.getLogger(__name__)
-_VERSION = 2
-"""Version of the format on disk."""
-_SNAP_DISTANCE = 0.015
-"""Largest distance from the true surface, relative to the size of the body, at which corners are moved onto it. CoACD
-rebuilds surfaces that are not closed on a grid; moving the corners keeps flat faces flat."""
-_MAX_BODIES = 128
-"""Largest number of bodies of one mesh that are decomposed one by one."""
-
-
 def cache_folder() -> Path:
     """Folder of cached decompositions: ``$SCENE_ENVS_CACHE``, else ``scene_envs`` in the user's cache folder."""
     if chosen := os.environ.get("SCENE_ENVS_CACHE"):
@@ -132,24 +132,15 @@ def cache_folder() -> Path:
 def convex_parts(
     mesh: trimesh.Trimesh, method: Method, tolerance: float, threshold: float, what: str
 ) -> tuple[list[ConvexPart], list[str], list[str]]:
-    """The convex parts of one mesh.
+    """The convex parts of one mesh (m), with notes and warnings; no parts when the mesh spans no volume.
 
-    Closed bodies are taken one by one: convex ones keep their shape, concave ones are decomposed. A surface
-    that is not closed is decomposed as a whole.
+    Closed bodies are taken one by one: convex ones, whose depth below their hull is at most ``tolerance`` (m), keep
+    their shape, concave ones are decomposed. A surface that is not closed is decomposed as a whole. ``threshold`` is
+    CoACD's concavity, relative to the size of the body; ``what`` names the mesh in messages.
 
     Args:
-        mesh: Triangles, m.
-        method: ``"convex"`` takes one hull of the whole mesh; ``"coacd"`` requires CoACD where a body is concave;
-            ``"auto"`` falls back to a hull where CoACD is not installed.
-        tolerance: Largest depth below its hull (m) of a body that counts as convex.
-        threshold: CoACD's concavity, relative to the size of the body.
-        what: Name of the mesh, for messages.
-
-    Returns:
-        Parts, notes and warnings; no parts when the mesh spans no volume.
-
-    Raises:
-        MissingDependencyError: ``"coacd"`` without the package.
+        method: ``"convex"`` takes one hull of the whole mesh; ``"coacd"`` requires CoACD where a body is concave, or
+            raises MissingDependencyError; ``"auto"`` falls back to a hull where CoACD is not installed.
     """
     surface = bare(mesh)
     if not len(surface.faces) or not has_volume(np.asarray(surface.vertices)):
@@ -168,14 +159,12 @@ def convex_parts(
             continue
         pieces = _decompose(body, method, threshold, what)
         if pieces is None:
-            warnings.append(
+            warnings = [
                 f"{what} is concave and is taken as its hull, because CoACD is not installed "
                 "(`pip install 'scene-envs[decomposition]'`)"
-            )
-            parts.append(hull)
-            continue
-        parts += [_hull(piece, tolerance) for piece in pieces]
-    return parts, notes, sorted(set(warnings))
+            ]
+        parts += [hull] if pieces is None else [_hull(piece, tolerance) for piece in pieces]
+    return parts, notes, warnings
 
 
 def _bodies(surface: trimesh.Trimesh, tolerance: float) -> tuple[list[trimesh.Trimesh], int]:
@@ -247,16 +236,9 @@ def _has_coacd() -> bool:
 
 
 def run_coacd(vertices: Array, faces: Array, settings: dict[str, Any], what: str) -> list[Array]:
-    """Corners (P, 3) of the convex pieces, from a process that is ended at the time limit of the import.
+    """Corners (P, 3) of the convex pieces of a mesh (V, 3), (F, 3), from a process that ends with the import's time.
 
-    Args:
-        vertices: (V, 3) corners of the mesh.
-        faces: (F, 3) int, rows of ``vertices``.
-        settings: Keywords of ``coacd.run_coacd``.
-        what: Name of the mesh, for messages.
-
-    Raises:
-        InvalidInputError: CoACD took too long, or failed.
+    Raises InvalidInputError when CoACD takes too long, or fails on the mesh called ``what``.
     """
     try:
         return run_apart(f"{__name__}:coacd_pieces", (vertices, faces, settings), seconds_left())  # type: ignore[no-any-return]
@@ -330,11 +312,6 @@ def _write(path: Path, pieces: Sequence[Array]) -> None:
         _LOGGER.warning("a decomposition could not be kept in %s: %s", path.parent, error)
 
 
-_SEGMENTS = 16
-_CAP = np.radians(15.0)
-"""Half angle of the flat faces at the poles of a ball, on which it can stand."""
-
-
 class Collision(NamedTuple):
     """Convex parts of one shape, the volume it fills (m^3), and remarks for the report."""
 
@@ -356,18 +333,15 @@ def meshes_of(shape: Shape) -> list[trimesh.Trimesh]:
     """
     assert shape.path is not None
     changed = shape.path.stat().st_mtime_ns if shape.path.is_file() else 0
-    return [_transformed(mesh, shape.pose, shape.size) for mesh in _file(shape.path, changed)]
-
-
-def _transformed(mesh: trimesh.Trimesh, pose: Array, scale: tuple[float, ...]) -> trimesh.Trimesh:
-    moved: Any = mesh.copy()
-    moved.vertices = (np.asarray(mesh.vertices) * scale) @ pose[:3, :3].T + pose[:3, 3]
-    if np.prod(scale) < 0:  # a mirror turns triangles inside out
-        colors = moved.visual.face_colors if moved.visual.kind == "face" else None
-        moved.faces = np.asarray(mesh.faces)[:, ::-1]
-        if colors is not None:
-            moved.visual.face_colors = colors
-    return moved  # type: ignore[no-any-return]
+    meshes: list[Any] = [mesh.copy() for mesh in _file(shape.path, changed)]
+    for mesh in meshes:
+        mesh.vertices = (np.asarray(mesh.vertices) * shape.size) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+        if np.prod(shape.size) < 0:  # a mirror turns triangles inside out
+            colors = mesh.visual.face_colors if mesh.visual.kind == "face" else None
+            mesh.faces = np.asarray(mesh.faces)[:, ::-1]
+            if colors is not None:
+                mesh.visual.face_colors = colors
+    return meshes
 
 
 def visual_of(shape: Shape, color: Color | None) -> list[trimesh.Trimesh]:
@@ -375,10 +349,6 @@ def visual_of(shape: Shape, color: Color | None) -> list[trimesh.Trimesh]:
     chosen = shape.color or color
     if shape.kind == "mesh":
         return [painted(mesh, chosen) for mesh in meshes_of(shape)]
-    return [painted(_smooth(shape), chosen)]
-
-
-def _smooth(shape: Shape) -> trimesh.Trimesh:
     from trimesh import creation
 
     size = shape.size
@@ -394,7 +364,7 @@ def _smooth(shape: Shape) -> trimesh.Trimesh:
         mesh = creation.icosphere(subdivisions=3)
         mesh.vertices = mesh.vertices * np.broadcast_to(size, 3)
     mesh.apply_transform(shape.pose)
-    return mesh  # type: ignore[no-any-return]
+    return [painted(mesh, chosen)]
 
 
 def collision_of(shape: Shape, method: Method, tolerance: float, threshold: float) -> Collision:
@@ -404,7 +374,8 @@ def collision_of(shape: Shape, method: Method, tolerance: float, threshold: floa
     circle. For meshes see :func:`convex_parts`.
     """
     if shape.kind != "mesh":
-        part = _placed(_primitive(shape), shape.pose)
+        part = _primitive(shape)
+        part = ConvexPart(part.vertices @ shape.pose[:3, :3].T + shape.pose[:3, 3], part.faces)
         return Collision([part], volume([part]), [], [])
     assert shape.path is not None
     result = Collision([], 0.0, [], [])
@@ -440,7 +411,3 @@ def _ball() -> Profile:
     """Half section of a unit ball with flat poles at z = -1 and 1."""
     angles = np.linspace(_CAP, np.pi - _CAP, 6)
     return [(float(np.sin(a)), float(-np.cos(a) / np.cos(_CAP))) for a in angles]
-
-
-def _placed(part: ConvexPart, pose: Array) -> ConvexPart:
-    return ConvexPart(part.vertices @ pose[:3, :3].T + pose[:3, 3], part.faces)

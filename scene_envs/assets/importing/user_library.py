@@ -5,20 +5,19 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
 from scene_envs.assets.base import Asset, AssetLibrary
-from scene_envs.assets.built_in import class_colors
 from scene_envs.assets.importing.build import (
     SUFFIXES,
     YAML_NAMES,
     AssetEntry,
     AssetReport,
     ImportReport,
+    build_asset,
     check_names,
     default_entry,
     distinct_colors,
@@ -34,7 +33,8 @@ from scene_envs.assets.importing.limits import (
     too_slow,
 )
 from scene_envs.assets.importing.mesh_files import Color
-from scene_envs.errors import InvalidInputError, SceneEnvsError, unknown_name
+from scene_envs.assets.recipes import RECIPES
+from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.workers import WorkerFailure, run_apart
 
 _LOGGER = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ def load_library(folder: str | os.PathLike[str]) -> AssetLibrary:
     assets: list[Asset] = []
     for entry in index.entries:
         try:
-            assets.append(index.build(entry.name))
+            assets.append(index.build(entry)[0])
         except SceneEnvsError as error:
             if index.is_listed:
                 raise
@@ -77,8 +77,7 @@ def import_report(folder: str | os.PathLike[str]) -> ImportReport:
     reports = []
     for entry in index.entries:
         try:
-            index.build(entry.name)
-            reports.append(index.report(entry.name))
+            reports.append(index.build(entry)[1])
         except SceneEnvsError as error:
             reports.append(AssetReport(entry.name, index.folder / entry.file, error=str(error)))
     return ImportReport(index.folder, tuple(reports), index.notes)
@@ -98,19 +97,10 @@ class FolderIndex:
         """Asset names, in order."""
         return [entry.name for entry in self.entries]
 
-    def build(self, name: str) -> Asset:
-        """The asset called ``name``; raises like :func:`load_library`, or UnknownNameError."""
-        return self._built(name)[0]
-
-    def report(self, name: str) -> AssetReport:
-        """Import report of the asset ``name``."""
-        return self._built(name)[1]
-
-    def _built(self, name: str) -> tuple[Asset, AssetReport]:
-        for entry in self.entries:
-            if entry.name == name:
-                return _built(self.folder, entry, _stamp(self.folder / entry.file))
-        raise unknown_name("asset", name, self.names)
+    def build(self, entry: AssetEntry) -> tuple[Asset, AssetReport]:
+        """The asset of an entry, and the report on its import; raises like :func:`load_library`."""
+        path = self.folder / entry.file
+        return _built(path, entry, _stamp(path))
 
 
 def folder_index(folder: str | os.PathLike[str]) -> FolderIndex:
@@ -127,15 +117,6 @@ def folder_index(folder: str | os.PathLike[str]) -> FolderIndex:
         if (root / name).is_file():
             return _listed(root / name, _stamp(root / name))
     return _unlisted(root, _stamp(root))
-
-
-def find_asset(name: str, folders: Sequence[str | os.PathLike[str]]) -> Asset | None:
-    """The asset called ``name`` from the first folder that has it, or None."""
-    for folder in folders:
-        index = folder_index(folder)
-        if name in index.names:
-            return index.build(name)
-    return None
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -180,7 +161,8 @@ def _named_files(path: Path) -> set[str]:
 def _colored(entries: list[AssetEntry]) -> tuple[AssetEntry, ...]:
     """Entries with a colour each, far from those of the built-in assets."""
     chosen: list[Color] = [entry.color for entry in entries if entry.color is not None]
-    fresh = iter(distinct_colors(len(entries) - len(chosen), (*class_colors(), *chosen)))
+    taken = [*(recipe.color for recipe in RECIPES.values()), *chosen]
+    fresh = iter(distinct_colors(len(entries) - len(chosen), taken))
     return tuple(
         entry if entry.color is not None else dataclasses.replace(entry, color=next(fresh)) for entry in entries
     )
@@ -188,32 +170,28 @@ def _colored(entries: list[AssetEntry]) -> tuple[AssetEntry, ...]:
 
 def build_in_time(request: tuple[Path, AssetEntry]) -> tuple[Asset, AssetReport]:
     """As :func:`~scene_envs.assets.importing.build.build_asset`, while the time of an import runs."""
-    from scene_envs.assets.importing.build import build_asset  # imported here, because it loads trimesh
-
     with timed(request[0]):
         return build_asset(*request)
 
 
 def _build_apart(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     """As :func:`build_in_time`, in a process of its own; InvalidInputError when it takes too long or crashes."""
-    try:
-        return run_apart(f"{__name__}:build_in_time", (path, entry), seconds_left())  # type: ignore[no-any-return]
-    except WorkerFailure as failure:
-        if failure.is_late:
-            raise too_slow("") from None
-        raise InvalidInputError(f"{path}: the import {failure}; simplify the file") from failure
+    with timed(path):
+        try:
+            return run_apart(f"{__name__}:build_in_time", (path, entry), seconds_left())  # type: ignore[no-any-return]
+        except WorkerFailure as failure:
+            if failure.is_late:
+                raise too_slow("") from None
+            raise InvalidInputError(f"{path}: the import {failure}; simplify the file") from failure
 
 
 @cache
-def _built(folder: Path, entry: AssetEntry, stamp: tuple[int, int]) -> tuple[Asset, AssetReport]:
-    from scene_envs.assets.importing.build import build_asset  # imported here, because it loads trimesh
-
+def _built(path: Path, entry: AssetEntry, stamp: tuple[int, int]) -> tuple[Asset, AssetReport]:
     try:
-        with timed(folder / entry.file, READ_HERE):
-            asset, report = in_time(lambda: build_asset(folder / entry.file, entry))
+        with timed(path, READ_HERE):
+            asset, report = in_time(lambda: build_asset(path, entry))
     except LargeImportError:
-        with timed(folder / entry.file):
-            asset, report = _build_apart(folder / entry.file, entry)
+        asset, report = _build_apart(path, entry)
     level = logging.WARNING if report.warnings else logging.INFO
     _LOGGER.log(level, "%s", report)
     return asset, report

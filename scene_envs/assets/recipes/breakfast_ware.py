@@ -25,14 +25,42 @@ from scene_envs.assets.shapes import (
     quad_faces,
     ring,
     rods,
+    sheet,
     solid,
     surface,
     tube,
+    walls,
 )
 
 _SIDES = 12
 _WHITE: Color = (246, 245, 240)
 _GLAZE: Color = (252, 251, 248)
+_MUG_RADIUS, _MUG_HEIGHT, _MUG_WALL, _MUG_FLOOR = 0.040, 0.085, 0.0045, 0.006
+_MUG_SIDES = 10
+_MUG_FACE = _MUG_RADIUS * math.cos(math.pi / _MUG_SIDES)
+"""Distance (m) from the axis of the flat face that the handle stands on."""
+_MUG_HANDLE = [(_MUG_FACE, 0.0, 0.068), (0.058, 0.0, 0.068), (0.068, 0.0, 0.045), (0.058, 0.0, 0.020),
+               (_MUG_FACE, 0.0, 0.020)]  # fmt: skip
+_TEAL: Color = (70, 140, 146)
+_TEAL_DARK: Color = (56, 118, 126)
+_JUG_FOOT, _JUG_RADIUS, _JUG_HEIGHT, _JUG_WALL, _JUG_FLOOR = 0.046, 0.0525, 0.182, 0.005, 0.007
+_JUG_HANDLE = [(0.0514, 0.0, 0.145), (0.076, 0.0, 0.145), (0.089, 0.0, 0.102), (0.076, 0.0, 0.055),
+               (0.0482, 0.0, 0.055)]  # fmt: skip
+_ENAMEL: Color = (232, 238, 240)
+_RIM: Color = (44, 82, 140)
+_STRIPE: Color = (96, 140, 190)
+_CROCK_RADIUS, _CROCK_HEIGHT, _CROCK_WALL, _CROCK_FLOOR = 0.065, 0.17, 0.008, 0.008
+_STAVES: tuple[Color, Color, Color] = ((222, 184, 126), (206, 164, 104), (232, 198, 144))
+_HOOP: Color = (150, 104, 58)
+_HOLLOW: Color = (180, 138, 88)
+# cutlery
+_STEEL: Color = (196, 200, 207)
+_BRIGHT: Color = (222, 226, 231)
+_SHADE: Color = (168, 173, 182)
+_THICK = 0.0034
+"""Thickness of the metal, m; thinner metal would vanish when engines shrink hulls by 1 mm."""
+Station = tuple[float, float, float, float]
+"""(x, width, lowest z, highest z) of a section across the length, m."""
 
 
 def _plate(radius: float, height: float, foot: float, base: float, band: Color, well: Color) -> Model:
@@ -80,16 +108,6 @@ def _handle(path: Sequence[tuple[float, float, float]], radius: float, color: Co
     return tube(arc(knots.tolist(), 20), radius, color)
 
 
-_MUG_RADIUS, _MUG_HEIGHT, _MUG_WALL, _MUG_FLOOR = 0.040, 0.085, 0.0045, 0.006
-_MUG_SIDES = 10
-_MUG_FACE = _MUG_RADIUS * math.cos(math.pi / _MUG_SIDES)
-"""Distance (m) from the axis of the flat face that the handle stands on."""
-_MUG_HANDLE = [(_MUG_FACE, 0.0, 0.068), (0.058, 0.0, 0.068), (0.068, 0.0, 0.045), (0.058, 0.0, 0.020),
-               (_MUG_FACE, 0.0, 0.020)]  # fmt: skip
-_TEAL: Color = (70, 140, 146)
-_TEAL_DARK: Color = (56, 118, 126)
-
-
 @asset_recipe("mug", display_name="mug", mass=0.25, color=(90, 50, 160))
 def mug() -> Model:
     """A straight mug with a handle toward +x."""
@@ -111,14 +129,6 @@ def mug() -> Model:
         _handle(_MUG_HANDLE, 0.0045, _TEAL),
     )  # fmt: skip
     return Model(visual, [floor, *wall, *handle], [hull_of([floor, *wall]), hull_of(handle)])
-
-
-_JUG_FOOT, _JUG_RADIUS, _JUG_HEIGHT, _JUG_WALL, _JUG_FLOOR = 0.046, 0.0525, 0.182, 0.005, 0.007
-_JUG_HANDLE = [(0.0514, 0.0, 0.145), (0.076, 0.0, 0.145), (0.089, 0.0, 0.102), (0.076, 0.0, 0.055),
-               (0.0482, 0.0, 0.055)]  # fmt: skip
-_ENAMEL: Color = (232, 238, 240)
-_RIM: Color = (44, 82, 140)
-_STRIPE: Color = (96, 140, 190)
 
 
 @asset_recipe("water_jug", display_name="water jug", mass=0.55, color=(0, 120, 230))
@@ -149,12 +159,6 @@ def water_jug() -> Model:
     return Model(visual, [floor, *wall, *handle], [hull_of([floor, *wall]), hull_of(handle)])
 
 
-_CROCK_RADIUS, _CROCK_HEIGHT, _CROCK_WALL, _CROCK_FLOOR = 0.065, 0.17, 0.008, 0.008
-_STAVES: tuple[Color, Color, Color] = ((222, 184, 126), (206, 164, 104), (232, 198, 144))
-_HOOP: Color = (150, 104, 58)
-_HOLLOW: Color = (180, 138, 88)
-
-
 @asset_recipe("utensil_crock", display_name="utensil crock", mass=0.40, color=(110, 70, 30))
 def utensil_crock() -> Model:
     """A bamboo crock, free within 55 mm of the axis and 162 mm deep, hollow in both levels of detail."""
@@ -181,16 +185,6 @@ def utensil_crock() -> Model:
     )  # fmt: skip
     parts = [floor, *wall]
     return Model(visual, parts, parts)
-
-
-_STEEL: Color = (196, 200, 207)
-_BRIGHT: Color = (222, 226, 231)
-_SHADE: Color = (168, 173, 182)
-_THICK = 0.0034
-"""Thickness of the metal, m; thinner metal would vanish when engines shrink hulls by 1 mm."""
-
-Station = tuple[float, float, float, float]
-"""(x, width, lowest z, highest z) of a section across the length, m."""
 
 
 def _section(station: Station, y: float = 0.0) -> Array:
@@ -274,10 +268,8 @@ def knife() -> Model:
 
 def _prism(low: Array, high: Array, color: Color) -> trimesh.Trimesh:
     """A sharp-edged skin between two outlines (K, 3), counter-clockwise from above, with its lid."""
-    count = len(low)
-    quads = np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1)
-    sides = surface(quads.reshape(-1, 3), quad_faces(count), color)
-    return join(sides, surface(high, fan(count), color), surface(low, fan(count)[:, ::-1], color))
+    sides = surface(walls(low, high).reshape(-1, 3), quad_faces(len(low)), color)
+    return join(sides, sheet(high, color), surface(low, fan(len(low))[:, ::-1], color))
 
 
 def _rounded(outline: Array, rounds: int = 2) -> Array:

@@ -1,4 +1,4 @@
-"""Apples, pears and avocados: solids of revolution that stand on a flat foot."""
+"""Food: apples, pears and avocados, which are solids of revolution on a flat foot, cereal and bread."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import trimesh
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import Model, asset_recipe
-from scene_envs.assets.recipes.painted import Cells, Paint, curve, loft, revolve, sheet
-from scene_envs.assets.shapes import Color, Profile, box, circle, convex_hull, hull_of, join, solid, tube
+from scene_envs.assets.recipes.painted import Cells, Paint, curve, loft, revolve
+from scene_envs.assets.shapes import Color, Profile, box, circle, convex_hull, hull_of, join, sheet, solid, tube
 
 _SIDES = 12
 _STEM: Color = (96, 66, 38)
@@ -21,6 +21,35 @@ _CONICAL = [(0.0, 0.08), (0.14, 0.05), (0.30, 0.0), (0.52, 0.05), (0.80, 0.30), 
             (0.84, 0.93), (0.58, 1.0), (0.33, 0.96), (0.12, 0.86), (0.0, 0.81)]  # fmt: skip
 _APPLE_HULL = [(0.48, 0.0), (0.96, 0.33), (1.0, 0.65), (0.68, 1.0)]
 _CONICAL_HULL = [(0.46, 0.0), (0.90, 0.38), (1.0, 0.74), (0.70, 1.0)]
+_AVOCADO = [(0.0, 0.02), (0.20, 0.005), (0.36, 0.0), (0.66, 0.04), (0.93, 0.21), (1.0, 0.38), (0.945, 0.53),
+            (0.80, 0.70), (0.62, 0.85), (0.42, 0.955), (0.18, 1.0), (0.0, 0.985)]  # fmt: skip
+_AVOCADO_HULL = [(0.46, 0.0), (0.94, 0.19), (1.0, 0.42), (0.82, 0.70), (0.40, 1.0)]
+# the cereal box, m
+_WIDTH, _DEPTH, _HEIGHT = 0.19, 0.06, 0.28
+_PRINT = 4e-4
+"""Distance (m) of the print in front of the board."""
+_BOARD: Color = (238, 160, 44)
+_FLAP: Color = (222, 140, 34)
+_BRAND: Color = (160, 34, 44)
+_CREAM: Color = (252, 244, 222)
+_BOWL: Color = (62, 116, 182)
+_MILK: Color = (250, 248, 242)
+_OAT: Color = (206, 146, 76)
+_HOLE: Color = (240, 228, 204)
+_RINGS = ((-0.036, 0.0), (-0.019, 0.009), (-0.014, -0.007), (0.004, 0.002), (0.018, 0.010), (0.022, -0.006),
+          (0.040, 0.001))  # fmt: skip
+"""Positions (m, from the middle of the bowl) of the cereal in the picture on the box."""
+_LETTERS = {
+    "O": ("###", "#.#", "#.#", "#.#", "###"),
+    "A": ("###", "#.#", "###", "#.#", "#.#"),
+    "T": ("###", ".#.", ".#.", ".#.", ".#."),
+    "S": ("###", "#..", "###", "..#", "###"),
+}
+# the bread slice
+_CRUST: Color = (150, 92, 44)
+_TOASTED: Color = (196, 138, 72)
+_CRUMB: Color = (232, 196, 134)
+_SLICE = 0.016
 
 
 def _scaled(profile: Profile, radius: float, height: float) -> list[tuple[float, float]]:
@@ -51,11 +80,7 @@ def _cheek(spread: float) -> Paint:
 
 def _ripening(height: float) -> Paint:
     """Paint from the colour at the blossom end (0) to the colour at the stem (4)."""
-
-    def paint(angle: Array, z: Array) -> Cells:
-        return np.clip(np.floor(5.0 * (z / height) + 0.0 * angle), 0, 4).astype(np.int64)
-
-    return paint
+    return lambda angle, z: np.clip(np.floor(5.0 * (z / height) + 0.0 * angle), 0, 4).astype(np.int64)
 
 
 def _pebbled(height: float) -> Paint:
@@ -151,11 +176,6 @@ def pear_red() -> Model:
     return _pear(0.075, 0.085, (0.56, 0.38, 0.68), _tones((206, 112, 66), (150, 30, 44)), _cheek(0.8))
 
 
-_AVOCADO = [(0.0, 0.02), (0.20, 0.005), (0.36, 0.0), (0.66, 0.04), (0.93, 0.21), (1.0, 0.38), (0.945, 0.53),
-            (0.80, 0.70), (0.62, 0.85), (0.42, 0.955), (0.18, 1.0), (0.0, 0.985)]  # fmt: skip
-_AVOCADO_HULL = [(0.46, 0.0), (0.94, 0.19), (1.0, 0.42), (0.82, 0.70), (0.40, 1.0)]
-
-
 def _avocado(diameter: float, height: float, colors: list[Color], paint: Paint, bumps: float) -> Model:
     part = solid(_scaled(_AVOCADO_HULL, diameter / 2.0, height), _SIDES)
 
@@ -183,29 +203,6 @@ def avocado_b() -> Model:
 def avocado_c() -> Model:
     """A large bright green avocado."""
     return _avocado(0.082, 0.120, _tones((104, 140, 52), (146, 172, 84)), _ripening(0.120), 0.01)
-
-
-_WIDTH, _DEPTH, _HEIGHT = 0.19, 0.06, 0.28
-_PRINT = 4e-4
-"""Distance (m) of the print in front of the board."""
-_BOARD: Color = (238, 160, 44)
-_FLAP: Color = (222, 140, 34)
-_BRAND: Color = (160, 34, 44)
-_CREAM: Color = (252, 244, 222)
-_BOWL: Color = (62, 116, 182)
-_MILK: Color = (250, 248, 242)
-_OAT: Color = (206, 146, 76)
-_HOLE: Color = (240, 228, 204)
-
-_RINGS = ((-0.036, 0.0), (-0.019, 0.009), (-0.014, -0.007), (0.004, 0.002), (0.018, 0.010), (0.022, -0.006),
-          (0.040, 0.001))  # fmt: skip
-"""Positions (m, from the middle of the bowl) of the cereal in the picture on the box."""
-_LETTERS = {
-    "O": ("###", "#.#", "#.#", "#.#", "###"),
-    "A": ("###", "#.#", "###", "#.#", "#.#"),
-    "T": ("###", ".#.", ".#.", ".#.", ".#."),
-    "S": ("###", "#..", "###", "..#", "###"),
-}
 
 
 @asset_recipe("cereal_box", display_name="cereal box", plural="cereal boxes", mass=0.45, color=(245, 135, 25))
@@ -265,12 +262,6 @@ def _sides() -> list[trimesh.Trimesh]:
             y = sign * width / 2.0
             printed.append(sheet([(x, -y, low), (x, y, low), (x, y, high), (x, -y, high)], color))
     return printed
-
-
-_CRUST: Color = (150, 92, 44)
-_TOASTED: Color = (196, 138, 72)
-_CRUMB: Color = (232, 196, 134)
-_SLICE = 0.016
 
 
 @asset_recipe("bread_slice", display_name="bread slice", mass=0.03, color=(190, 115, 55))

@@ -35,6 +35,14 @@ _CHAIR: Color = (150, 102, 66)
 _CHAIR_DARK: Color = (130, 86, 54)
 _CUSHION: Color = (176, 128, 88)
 _TILES: list[Color] = [(216, 210, 200), (206, 199, 188), (220, 215, 206), (201, 194, 182)]
+# the shelf
+TIERS = (-0.3915, -0.1232, 0.1392, 0.4075)
+"""Heights of the upper surfaces of the boards in the frame of the shelf, m."""
+BOARD = 0.016
+"""Thickness of boards and sides, m."""
+BACK = 0.005
+"""Thickness of the back, m."""
+_DEPTH, _WIDTH = 0.30, 0.60
 
 
 @asset_recipe("cafe_table", display_name="table", mass=0.0, color=(139, 98, 66))
@@ -112,15 +120,6 @@ def floor() -> Model:
     ]
     part = box(size, (0.0, 0.0, -size[2]))
     return Model(painted_box(size, _TILES[1], {"top": tiles}, base=(0.0, 0.0, -size[2])), [part], [part])
-
-
-TIERS = (-0.3915, -0.1232, 0.1392, 0.4075)
-"""Heights of the upper surfaces of the boards in the frame of the shelf, m."""
-BOARD = 0.016
-"""Thickness of boards and sides, m."""
-BACK = 0.005
-"""Thickness of the back, m."""
-_DEPTH, _WIDTH = 0.30, 0.60
 
 
 @asset_recipe("shelf", display_name="shelf", plural="shelves", mass=0.0, color=(160, 128, 72))

@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from scene_envs.arrays import Array
-from scene_envs.assets.shapes import Color, Profile, arc, circle, fan, join, quad_faces, surface
+from scene_envs.assets.shapes import Color, Profile, arc, circle, join, quad_faces, sheet, surface, walls
 
 Cells = NDArray[np.int64]
 """Indices into the colours of a surface, one per cell."""
@@ -33,15 +33,11 @@ def revolve(
     segments: int = 32,
     swell: Callable[[Array, Array], Array] | None = None,
 ) -> trimesh.Trimesh:
-    """Revolve a smooth half section about z and paint it cell by cell.
+    """Revolve a smooth half section (P, 2), points (r, z) m, about z and paint it cell by cell.
 
-    Args:
-        profile: (P, 2) points (r, z), m, with the outside on the right, as for
-            :func:`~scene_envs.assets.shapes.lathe`.
-        colors: Colours that ``paint`` chooses from.
-        paint: Function from angle and height of the middle of a cell to the index of its colour.
-        segments: Number of cells around the axis.
-        swell: Function from angle (rad) and height (m) to a factor on the radius, for lobes and spouts.
+    The outside is on the right of the profile, as for :func:`~scene_envs.assets.shapes.lathe`. ``paint`` chooses from
+    ``colors`` by angle and height of the middle of a cell. ``swell`` is a factor on the radius by angle (rad) and
+    height (m), for lobes and spouts.
     """
     section = np.asarray(profile, dtype=np.float64)
     angles = 2.0 * np.pi * np.arange(segments) / segments
@@ -58,52 +54,35 @@ def revolve(
 
 
 def sleeve(radius: float, levels: ArrayLike, colors: Sequence[Color]) -> trimesh.Trimesh:
-    """The wall of a cylinder in bands whose edges may wave.
+    """The wall of a cylinder of ``radius`` m in K - 1 coloured bands whose edges may wave.
 
-    Args:
-        radius: Radius of the cylinder, m.
-        levels: (K, segments) heights (m) of the edges of the bands, bottom first, one per angle.
-        colors: K - 1 colours.
+    ``levels`` (K, segments) are the heights (m) of the edges of the bands, bottom first, one per angle.
     """
     heights = np.asarray(levels, dtype=np.float64)
     unit = circle(heights.shape[1])
-    points = np.stack(
-        [
-            np.broadcast_to(radius * unit[:, 0], heights.shape),
-            np.broadcast_to(radius * unit[:, 1], heights.shape),
-            heights,
-        ],
-        axis=-1,
-    )
+    x, y = (np.broadcast_to(radius * unit[:, axis], heights.shape) for axis in (0, 1))
+    points = np.stack([x, y, heights], axis=-1)
     normals = np.broadcast_to(np.column_stack([unit, np.zeros(len(unit))]), points.shape)
     bands = np.repeat(np.arange(len(heights) - 1)[:, None], heights.shape[1], axis=1)
     return _painted(points, normals, bands, colors)
 
 
 def loft(loops: ArrayLike, colors: Sequence[Color]) -> trimesh.Trimesh:
-    """A closed body between convex outlines, all counter-clockwise seen from above, bottom first.
+    """A closed body between convex outlines (K, P, 3) m, all counter-clockwise seen from above, bottom first.
 
-    Args:
-        loops: (K, P, 3) outlines, m; the first and the last are flat and filled in.
-        colors: K + 1 colours: the underside, K - 1 walls, the top.
+    The first and the last outline are flat and filled in. Colours: the underside, K - 1 walls, the top.
     """
     outlines = np.asarray(loops, dtype=np.float64)
-    walls = []
+    skins = []
     for low, high, color in zip(outlines[:-1], outlines[1:], colors[1:-1], strict=True):
-        quads = np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1)
+        quads = walls(low, high)
         facing = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
         facing /= np.linalg.norm(facing, axis=1, keepdims=True)
         corner = facing + np.roll(facing, 1, axis=0)
         corner /= np.linalg.norm(corner, axis=1, keepdims=True)
         normals = np.stack([corner, np.roll(corner, -1, axis=0), np.roll(corner, -1, axis=0), corner], axis=1)
-        walls.append(surface(quads.reshape(-1, 3), quad_faces(len(quads)), color, normals.reshape(-1, 3)))
-    return join(sheet(outlines[0, ::-1], colors[0]), *walls, sheet(outlines[-1], colors[-1]))
-
-
-def sheet(outline: ArrayLike, color: Color) -> trimesh.Trimesh:
-    """A flat convex face (P, 3), counter-clockwise seen from its front: a lid, a label, a letter's stroke."""
-    points = np.asarray(outline, dtype=np.float64)
-    return surface(points, fan(len(points)), color)
+        skins.append(surface(quads.reshape(-1, 3), quad_faces(len(quads)), color, normals.reshape(-1, 3)))
+    return join(sheet(outlines[0, ::-1], colors[0]), *skins, sheet(outlines[-1], colors[-1]))
 
 
 def _normals(points: Array, section: Array) -> Array:

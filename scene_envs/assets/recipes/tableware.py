@@ -1,17 +1,16 @@
-"""Flat ware: a flat base with a rim that rises outward."""
+"""Plates, bowls, a can, a bottle, steamers, a teacup and a teapot."""
 
 from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import trimesh
 
 from scene_envs.arrays import Array
-from scene_envs.assets.base import ConvexPart, Model, asset_recipe
-from scene_envs.assets.recipes.painted import sheet, sleeve
+from scene_envs.assets.base import Model, asset_recipe
+from scene_envs.assets.recipes.painted import sleeve
 from scene_envs.assets.shapes import (
     Color,
     Profile,
@@ -24,6 +23,7 @@ from scene_envs.assets.shapes import (
     planks,
     ring,
     rods,
+    sheet,
     solid,
     tube,
 )
@@ -33,6 +33,39 @@ _GLAZE: Color = (252, 251, 247)
 _RUBY: Color = (164, 40, 52)
 _SLATE: Color = (74, 104, 118)
 _SHALLOW: Color = (222, 232, 232)
+_SIDES = 12
+_SILVER: Color = (196, 199, 204)
+_BRUSHED: Color = (172, 176, 182)
+_SHADE: Color = (140, 144, 150)
+_COLA: Color = (206, 28, 36)
+_WAVE: Color = (250, 248, 244)
+_CAN_RADIUS, _CAN_HEIGHT = 0.0334, 0.122
+_TEA: Color = (176, 108, 44)
+_GLASS: Color = (196, 132, 60)
+_LABEL: Color = (64, 128, 70)
+_CREAM: Color = (236, 240, 216)
+_CAP: Color = (46, 92, 58)
+_LABEL_RADIUS = 0.0325
+_BODY = [(0.0325, 0.0), (0.0325, 0.140), (0.015, 0.176)]
+_NECK = [(0.015, 0.176), (0.015, 0.208)]
+# the steamer and its lid, m
+_RADIUS, _HEIGHT, _WALL = 0.12, 0.091, 0.009
+_FLOOR = (0.008, 0.014)
+_LID_HEIGHT, _LID_RIM, _LID_TOP, _LID_WALL = 0.06, 0.018, 0.042, 0.012
+_BAMBOO: Color = (238, 203, 152)
+_BAND: Color = (203, 153, 96)
+_INNER: Color = (242, 213, 168)
+_SLATS: tuple[Color, Color] = ((240, 208, 158), (222, 183, 128))
+_TEA_PORCELAIN: Color = (248, 246, 241)
+_INSIDE: Color = (226, 238, 232)
+_COBALT: Color = (48, 84, 150)
+_FOOT: Color = (206, 196, 180)
+_CUP_RADIUS, _CUP_FOOT, _CUP_HEIGHT, _CUP_FLOOR, _CUP_WALL = 0.0425, 0.030, 0.07, 0.006, 0.005
+_CUP_HANDLE = [(0.0385, 0.0, 0.056), (0.061, 0.0, 0.054), (0.061, 0.0, 0.030), (0.0345, 0.0, 0.022)]
+_POT_BODY = [(0.052, 0.0), (0.075, 0.045), (0.066, 0.090), (0.036, 0.118)]
+_POT_SPOUT = [(0.066, 0.0, 0.045), (0.083, 0.0, 0.070), (0.0945, 0.0, 0.108)]
+_POT_HANDLE = [(-0.062, 0.0, 0.098), (-0.086, 0.0, 0.104), (-0.095, 0.0, 0.080), (-0.089, 0.0, 0.052),
+               (-0.068, 0.0, 0.036)]  # fmt: skip
 
 
 @asset_recipe("dinner_plate", display_name="plate", mass=0.60, color=(214, 74, 66))
@@ -75,34 +108,19 @@ def serving_dish() -> Model:
     return Model(join(visual), [base, *rim], [hull_of([base, *rim])])
 
 
-_SIDES = 12
-
-
-class _Bowl(NamedTuple):
-    """Lengths (m): outside and inside (r, z) at the joint of the bands, and sizes of floor and rim."""
-
-    foot: float
-    floor: float
-    outer: tuple[float, float]
-    inner: tuple[float, float]
-    radius: float
-    height: float
-    wall: float
-
-    def parts(self) -> list[ConvexPart]:
-        """The floor disc and the two bands of wedges."""
-        low = [(self.foot, 0.0), self.outer, self.inner, (self.foot, self.floor)]
-        high = [self.outer, (self.radius, self.height), (self.radius - self.wall, self.height), self.inner]
-        floor = solid([(self.foot, 0.0), (self.foot, self.floor)], _SIDES)
-        return [floor, *ring(low, _SIDES), *ring(high, _SIDES)]
-
-
-_CEREAL = _Bowl(0.036, 0.006, (0.0605, 0.027), (0.0555, 0.029), 0.0725, 0.065, 0.005)
-_FRUIT = _Bowl(0.052, 0.006, (0.091, 0.033), (0.086, 0.036), 0.110, 0.075, 0.005)
-
-
-def _model(bowl: _Bowl, profile: Profile, colors: list[Color]) -> Model:
-    parts = bowl.parts()
+def _bowl(
+    foot: float,
+    outer: tuple[float, float],
+    inner: tuple[float, float],
+    rim: tuple[float, float],
+    profile: Profile,
+    colors: list[Color],
+) -> Model:
+    """A bowl (m) of a floor disc and two bands of wedges that meet at ``outer`` and ``inner``, both (r, z)."""
+    low = [(foot, 0.0), outer, inner, (foot, 0.006)]
+    high = [outer, rim, (rim[0] - 0.005, rim[1]), inner]
+    floor = solid([(foot, 0.0), (foot, 0.006)], _SIDES)
+    parts = [floor, *ring(low, _SIDES), *ring(high, _SIDES)]
     return Model(lathe(profile, colors, segments=56), parts, parts)
 
 
@@ -111,8 +129,8 @@ def bowl() -> Model:
     """A cereal bowl; its floor is flat within 34 mm of the axis, 6 mm above the table."""
     blue: Color = (112, 150, 176)
     inside: Color = (240, 240, 234)
-    return _model(
-        _CEREAL,
+    return _bowl(
+        0.036, (0.0605, 0.027), (0.0555, 0.029), (0.0725, 0.065),
         [
             (0.0, 0.003), (0.029, 0.003), (0.031, 0.0), (0.035, 0.0), (0.036, 0.0025), (0.0455, 0.0095),
             (0.0540, 0.0175), (0.0605, 0.0270), (0.0655, 0.0390), (0.0692, 0.0510), (0.0722, 0.0632),
@@ -129,8 +147,8 @@ def fruit_bowl() -> Model:
     wood: Color = (168, 112, 64)
     dark: Color = (140, 88, 48)
     grain: Color = (184, 130, 80)
-    return _model(
-        _FRUIT,
+    return _bowl(
+        0.052, (0.091, 0.033), (0.086, 0.036), (0.110, 0.075),
         [
             (0.0, 0.003), (0.045, 0.003), (0.047, 0.0), (0.051, 0.0), (0.052, 0.0025), (0.0690, 0.0130),
             (0.0815, 0.0230), (0.0910, 0.0335), (0.0985, 0.0460), (0.1045, 0.0590), (0.1095, 0.0730), (0.1085, 0.0750),
@@ -139,15 +157,6 @@ def fruit_bowl() -> Model:
         ],
         [*[dark] * 4, wood, wood, wood, grain, wood, wood, dark, dark, grain, wood, grain, wood, grain, wood, grain],
     )  # fmt: skip
-
-
-_SILVER: Color = (196, 199, 204)
-_BRUSHED: Color = (172, 176, 182)
-_SHADE: Color = (140, 144, 150)
-_COLA: Color = (206, 28, 36)
-_WAVE: Color = (250, 248, 244)
-
-_CAN_RADIUS, _CAN_HEIGHT = 0.0334, 0.122
 
 
 @asset_recipe("soda_can", display_name="coke can", mass=0.37, color=(255, 0, 0))
@@ -185,17 +194,6 @@ def _lid(z: float) -> trimesh.Trimesh:
     return join(at(mouth, 0.0, _SHADE), at(ring, 0.0012, _SILVER), at(hole, 0.0016, _SHADE))
 
 
-_TEA: Color = (176, 108, 44)
-_GLASS: Color = (196, 132, 60)
-_LABEL: Color = (64, 128, 70)
-_CREAM: Color = (236, 240, 216)
-_CAP: Color = (46, 92, 58)
-
-_LABEL_RADIUS = 0.0325
-_BODY = [(0.0325, 0.0), (0.0325, 0.140), (0.015, 0.176)]
-_NECK = [(0.015, 0.176), (0.015, 0.208)]
-
-
 @asset_recipe("tea_bottle", display_name="tea bottle", mass=0.53, color=(10, 70, 110))
 def tea_bottle() -> Model:
     """A bottle of tea with a green label and cap."""
@@ -221,15 +219,6 @@ def tea_bottle() -> Model:
     levels = [np.full(48, 0.054), middle - leaf, middle, middle + leaf, np.full(48, 0.106)]
     label = sleeve(_LABEL_RADIUS, levels, [_CREAM, _LABEL, _CAP, _CREAM])
     return Model(join(glass, label, shoulder), [body, neck], [body, neck])
-
-
-_RADIUS, _HEIGHT, _WALL = 0.12, 0.091, 0.009
-_FLOOR = (0.008, 0.014)
-_LID_HEIGHT, _LID_RIM, _LID_TOP, _LID_WALL = 0.06, 0.018, 0.042, 0.012
-_BAMBOO: Color = (238, 203, 152)
-_BAND: Color = (203, 153, 96)
-_INNER: Color = (242, 213, 168)
-_SLATS: tuple[Color, Color] = ((240, 208, 158), (222, 183, 128))
 
 
 @asset_recipe("steamer_bottom", display_name="steamer bottom", mass=0.35, color=(224, 172, 88))
@@ -273,20 +262,6 @@ def steamer_lid() -> Model:
         ),
     )
     return Model(visual, [*rim, cap, knob], [hull_of([*rim, cap]), knob])
-
-
-_TEA_PORCELAIN: Color = (248, 246, 241)
-_INSIDE: Color = (226, 238, 232)
-_COBALT: Color = (48, 84, 150)
-_FOOT: Color = (206, 196, 180)
-
-_CUP_RADIUS, _CUP_FOOT, _CUP_HEIGHT, _CUP_FLOOR, _CUP_WALL = 0.0425, 0.030, 0.07, 0.006, 0.005
-_CUP_HANDLE = [(0.0385, 0.0, 0.056), (0.061, 0.0, 0.054), (0.061, 0.0, 0.030), (0.0345, 0.0, 0.022)]
-
-_POT_BODY = [(0.052, 0.0), (0.075, 0.045), (0.066, 0.090), (0.036, 0.118)]
-_POT_SPOUT = [(0.066, 0.0, 0.045), (0.083, 0.0, 0.070), (0.0945, 0.0, 0.108)]
-_POT_HANDLE = [(-0.062, 0.0, 0.098), (-0.086, 0.0, 0.104), (-0.095, 0.0, 0.080), (-0.089, 0.0, 0.052),
-               (-0.068, 0.0, 0.036)]  # fmt: skip
 
 
 @asset_recipe("teacup", display_name="cup", mass=0.20, color=(168, 94, 196))

@@ -35,6 +35,9 @@ _RINGS: list[tuple[float, Color]] = [
 _BASE, _RING, _HEIGHT = 0.012, 0.019, 0.13
 _TO_X = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 """Turns the z axis to +x."""
+# game boxes
+_CARD: Color = (226, 220, 208)
+_WHITE: Color = (248, 246, 240)
 
 
 def _bulge(radius: float, z: float, height: float, rounding: float, samples: int) -> Profile:
@@ -77,7 +80,10 @@ def toy_train() -> Model:
     boiler = convex_hull(
         solid([(radius, -0.009), (radius, 0.043)], 12, np.pi / 12).vertices @ _TO_X.T + [0.0, 0.0, axis]
     )
-    boiler = convex_hull(np.concatenate([boiler.vertices, _feet(boiler.vertices, deck)]))
+    feet = [
+        [x, y, deck] for x in boiler.bounds[:, 0] for y in (-0.006, 0.006)
+    ]  # under its middle: it rests on the deck
+    boiler = convex_hull(np.concatenate([boiler.vertices, feet]))
     wheel = lathe([(0.0, -0.004), (0.0088, -0.004), (0.009, 0.0), (0.0, 0.0)], [black, black, red], segments=20)
     hub = lathe([(0.0035, 0.0), (0.0, 0.0012)], gold, segments=12)
     to_y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -109,16 +115,6 @@ def toy_train() -> Model:
         ),
     )  # fmt: skip
     return Model(visual, [wheels, body, cab, boiler], [hull_of([wheels, body]), hull_of([cab, boiler])])
-
-
-def _feet(vertices: np.ndarray, z: float) -> np.ndarray:
-    """Corners at height ``z`` under the middle of a lying cylinder, so that it rests on its support."""
-    ends = vertices[:, 0].min(), vertices[:, 0].max()
-    return np.array([[x, y, z] for x in ends for y in (-0.006, 0.006)])
-
-
-_CARD: Color = (226, 220, 208)
-_WHITE: Color = (248, 246, 240)
 
 
 def _lidded(
