@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 
 from agents.post_training.rollouts import PROMPTS_NAME, PromptSets, save_prompts, stream_seed
 from agents.post_training.run_files import BASE_SAMPLES_NAME, SCENES_NAME, writing
-from agents.post_training.settings import PostTrainConfig, RegularisationSettings
+from agents.post_training.settings import RegularisationSettings
 from agents.priors.prior import ScenePrior, asked_objects
 from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
@@ -173,8 +173,11 @@ def kept_base_samples(
     directory: Path,
     base: ScenePrior,
     bank: SceneBank,
-    config: PostTrainConfig,
+    count: int,
+    seed: int,
     *,
+    num_steps: int,
+    batch_size: int,
     reuse: bool,
     progress: str = "none",
 ) -> PromptedScenes:
@@ -186,12 +189,15 @@ def kept_base_samples(
         directory: folder of the run.
         base: the base prior.
         bank: real scenes, which give the prompts and the number of slots.
-        config: configuration of the run.
+        count: number of samples.
+        seed: seed of the run.
+        num_steps: denoiser evaluations per sample.
+        batch_size: number of scenes sampled at once.
         reuse: load the samples that are already in the folder, as a resumed run does.
         progress: a style of :class:`~scene_envs.progress.Progress`.
     """
-    path, processes, count = directory / BASE_SAMPLES_NAME, ProcessGroup.current(), config.regularisation.base_samples
-    prompts = bank.batch(count, Generator().manual_seed(stream_seed(config.seed, "base_prompts"))).prompts
+    path, processes = directory / BASE_SAMPLES_NAME, ProcessGroup.current()
+    prompts = bank.batch(count, Generator().manual_seed(stream_seed(seed, "base_prompts"))).prompts
     if processes.is_first and not (reuse and path.exists()):
         with Progress("base samples", count, style=progress, always=(0,)) as shown:
             shown.update(0, "", f"drawing {count} samples of the base prior")
@@ -199,10 +205,10 @@ def kept_base_samples(
                 count,
                 prompt=prompts,
                 physics_guidance=0.0,
-                num_steps=config.num_steps,
+                num_steps=num_steps,
                 slots=bank.train.shape[1],
-                seed=stream_seed(config.seed, "base_samples"),
-                batch_size=config.batch_size,
+                seed=stream_seed(seed, "base_samples"),
+                batch_size=batch_size,
             )
         writing(f"the base prior's samples {str(path)!r}", lambda: batch.save(path))
     processes.wait()

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
-from agents.post_training.learner import LearnedRewards
 from agents.post_training.rollouts import PromptDeck, prompts_beside, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
@@ -30,8 +29,8 @@ from agents.post_training.trainer import PostTrainResult, post_train
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import load_checkpoint
 from agents.utils.process_group import ProcessGroup
-from rewards import PromptMatch, RewardContext, RewardOutput, evaluate_reward, reward_label
-from rewards.process import close_reward, run_reward
+from rewards import PromptMatch, RewardContext, RewardOutput, evaluate_reward, learned_parts, reward_label
+from rewards.process import close_reward
 from scene_envs.files import page_part, page_template
 from scene_envs.scene import SceneBatch
 
@@ -519,6 +518,11 @@ def post_train_and_compare(
     """
     from scene_envs.physics import make_pool
 
+    def say(text: str) -> None:
+        """Print on stderr what is done next, unless the run shows no progress."""
+        if config.progress != "none":
+            print(text, file=sys.stderr, flush=True)
+
     started = time.perf_counter()
     base = ScenePrior.load(config.prior if prior is None else prior)
     result = post_train(config, prior=base)
@@ -526,54 +530,52 @@ def post_train_and_compare(
         return result.metrics
     trained = time.perf_counter()
     seed = config.seed + SAMPLE_SEED
-    prompts = _measured_prompts(config, base, scenes)
-    workers = 0 if config.workers == "ray" else config.workers
-    reward = run_reward(
-        config.reward, seed=config.seed, timeout=config.reward_timeout, memory=config.reward_memory, workers=workers
-    )
+    directory, slots = config.directory, base.config.slots if config.slots is None else config.slots
+    prompts = None
+    if config.prompt is not None:
+        prompts = _measured_prompts(directory, base, config.prompt, scenes, slots, config.seed)
+    reward = config.resolved_reward()
     with make_pool(config.workers, PHYSICS_TIMEOUT) as pool, ExitStack() as stack:
         stack.callback(close_reward, reward)
-        load_learned_rewards(reward, config)
+        load_learned_rewards(reward, directory, config.guard.scenes, config.seed)
 
         def measure(prior: ScenePrior) -> Measured:
             return measure_prior(
                 prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=prompts, guidance=config.guidance,
-                claim_guidance=config.claim_guidance, slots=config.slots, reward=reward,
+                claim_guidance=config.claim_guidance, slots=slots, reward=reward,
             )  # fmt: skip
 
-        say_stage(config, f"measuring {scenes} samples of the base prior")
+        say(f"measuring {scenes} samples of the base prior")
         before = measure(base)
-        say_stage(config, f"measuring {scenes} samples of the post-trained prior")
+        say(f"measuring {scenes} samples of the post-trained prior")
         after = measure(result.prior)
     seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
-    say_stage(config, "drawing the report")
+    say("drawing the report")
     title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_label(config.reward)}"
     extra = {"stage_seconds": seconds, "num_steps": num_steps}
     return write_comparison(result, before, after, title=title, extra=extra)
 
 
-def load_learned_rewards(reward: Any, config: PostTrainConfig) -> None:
-    """Give the parts of ``reward`` that learn their state at the end of a run."""
-    learned = LearnedRewards(reward, config)
-    if learned:
-        real = SceneBatch.load(config.directory / SCENES_NAME)
-        learned.begin(real[: len(real) - config.guard.scenes])
-        learned.restore(load_checkpoint(config.directory / CHECKPOINT_NAME)["learner"])
+def load_learned_rewards(reward: Any, directory: Path, heldout: int, seed: int) -> None:
+    """Give the parts of ``reward`` that learn their state at the end of a run.
+
+    Args:
+        reward: resolved reward.
+        directory: folder of the run.
+        heldout: number of real scenes that the guard held out.
+        seed: seed of the run.
+    """
+    if parts := learned_parts(reward):
+        real = SceneBatch.load(directory / SCENES_NAME)
+        state = load_checkpoint(directory / CHECKPOINT_NAME)["learner"]["learned_rewards"]
+        for part, own in zip(parts, state, strict=True):
+            part.begin(real[: len(real) - heldout], stream_seed(seed, "discriminator"))
+            part.load_state_dict(own)
 
 
-def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) -> list[str] | None:
-    """One prompt per measured sample, from the source of the run's prompts; None for a run without prompts."""
-    if config.prompt is None:
-        return None
-    directory = config.directory
+def _measured_prompts(directory: Path, prior: ScenePrior, prompt: Any, count: int, slots: int, seed: int) -> list[str]:
+    """One prompt per measured sample, from the source of the run's prompts."""
     batch = SceneBatch.load(directory / SCENES_NAME)
-    real = prompts_beside(directory, batch, stream_seed(config.seed, "bank"))
-    slots = prior.config.slots if config.slots is None else config.slots
-    deck = PromptDeck.of(prior, config.prompt, 1, slots, real, len(batch))
-    return deck.deal(count, Generator().manual_seed(config.seed + SAMPLE_SEED))
-
-
-def say_stage(config: PostTrainConfig, text: str) -> None:
-    """Tell on stderr what is done next, unless the run shows no progress."""
-    if config.progress != "none":
-        print(text, file=sys.stderr, flush=True)
+    real = prompts_beside(directory, batch, stream_seed(seed, "bank"))
+    deck = PromptDeck.of(prior, prompt, 1, slots, real, len(batch))
+    return deck.deal(count, Generator().manual_seed(seed + SAMPLE_SEED))

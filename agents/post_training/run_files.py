@@ -1,4 +1,4 @@
-"""Files of a run: configuration, log and metrics, each written atomically."""
+"""Files of a run: configuration, log, metrics and curve; and its progress on the terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from agents.configuration.composition import config_text, dotted
-from agents.post_training.settings import RESUMABLE, PostTrainConfig
+from agents.post_training.settings import RESUMABLE
 from agents.utils.checkpoints import load_checkpoint
 from scene_envs import files
 from scene_envs.errors import InvalidInputError, TrainingError
@@ -43,9 +43,9 @@ def writing(what: str, write: Callable[[], object]) -> None:
         raise TrainingError(f"could not write {what} ({error}); free some space and run the same again") from error
 
 
-def write_config(directory: Path, config: PostTrainConfig) -> None:
-    """Write ``config.yaml`` with every field of ``config``."""
-    write_text(directory / "config.yaml", files.sealed(config_text(config.plain())))
+def write_config(directory: Path, config: Mapping[str, Any]) -> None:
+    """Write ``config.yaml`` from the plain values of a configuration."""
+    write_text(directory / "config.yaml", files.sealed(config_text(config)))
 
 
 def run_metrics(
@@ -86,8 +86,8 @@ def write_log(directory: Path, history: Sequence[Mapping[str, float]]) -> None:
     write_text(directory / LOG_NAME, text.getvalue())
 
 
-def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] | None:
-    """The checkpoint of an interrupted run of the same configuration, or None when there is none.
+def load_resumable(directory: Path, config: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The checkpoint of an interrupted run of the same configuration, given as plain values; None without one.
 
     Raises:
         CorruptFileError: the checkpoint is truncated.
@@ -97,7 +97,7 @@ def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] |
     if not path.exists():
         return None
     state = load_checkpoint(path)
-    before, now = _flat(state.get("config", {})), _flat(config.plain())
+    before, now = _flat(state.get("config", {})), _flat(config)
     changed = [
         name for name in now if name.partition(".")[0] not in RESUMABLE and before.get(name, now[name]) != now[name]
     ]

@@ -257,7 +257,7 @@ def register_algorithm(
 ) -> Callable[[Algorithm], Algorithm]:
     """Make an algorithm available as ``algorithm=name``; the same name again replaces it.
 
-    The decorated class takes ``(settings, policy, stds)`` and extends :class:`~agents.post_training.algorithms.base.Algorithm` or one
+    The decorated class takes ``(settings, policy, stds)`` and extends :class:`agents.post_training.Algorithm` or one
     of its subclasses, such as :class:`agents.post_training.DDPO`.
 
     Args:
@@ -665,6 +665,18 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
     def directory(self) -> Path:
         """The run directory."""
         return Path(self.output or "runs/post-train")
+
+    def resolved_reward(self) -> Any:
+        """The reward of a run, as :func:`rewards.process.run_reward` gives it; its caller closes it."""
+        from rewards.process import run_reward
+
+        return run_reward(
+            self.reward,
+            seed=self.seed,
+            timeout=self.reward_timeout,
+            memory=self.reward_memory,
+            workers=0 if self.workers == "ray" else self.workers,
+        )
 
     def plain(self) -> dict[str, Any]:
         """The configuration as numbers, strings and lists; a reward given as an object becomes its name."""

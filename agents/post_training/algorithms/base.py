@@ -37,10 +37,6 @@ class BatchGradient:
     loss: float
     columns: Mapping[str, float] = field(default_factory=dict)
 
-    def figures(self) -> Mapping[str, float]:
-        """Further columns of the log."""
-        return self.columns
-
 
 class GradientSum:
     """Sum of the gradients of parts of a batch, each of which is complete before it is added.
