@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from agents.post_training.algorithms.base import prompted_loss
 from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup
 from agents.utils.seeds import derived_seed
@@ -230,9 +229,10 @@ class Guard:
         device = next(prior.parameters()).device
         if self.prompts is not None:
             generator = Generator().manual_seed(self.seed)
+            chunks = [self.prompts[start : start + _CHUNK] for start in range(0, len(self.heldout), _CHUNK)]
             losses = [
-                prompted_loss(prior, x0.to(device), self.prompts[start : start + _CHUNK], generator)
-                for start, x0 in zip(range(0, len(self.heldout), _CHUNK), self.heldout.split(_CHUNK), strict=True)
+                prior.pretraining_loss(x0.to(device), generator, "none", text=prior.encode_prompts(prompts))
+                for x0, prompts in zip(self.heldout.split(_CHUNK), chunks, strict=True)
             ]
             return float(torch.cat(losses).mean())
         return heldout_loss(prior, self.heldout.to(device), seed=self.seed)

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Generator, Tensor
 
-from agents.post_training.algorithms.base import Advantage, Algorithm, BatchGradient, GradientSum, PlainLoss, draw_steps
+from agents.post_training.algorithms.base import Advantage, Algorithm, BatchGradient, GradientSum, PlainLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.settings import DDPOISSettings, DDPOSFSettings
 from agents.utils.process_group import ProcessGroup
@@ -239,6 +239,13 @@ class DDPO(Algorithm):
         """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that enter it."""
         steps, scale = draw_steps(self.loss.step_weights.cpu(), self.settings.gradient_steps, generator)
         return accumulate_policy_gradient(self.loss, batch, steps, scale=scale)
+
+
+def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[int], float]:
+    """``count`` distinct steps of positive weight, and the factor that scales their sum to all such steps."""
+    eligible = torch.nonzero(weights > 0).flatten()
+    chosen = eligible[torch.randperm(len(eligible), generator=generator)[:count]]
+    return sorted(chosen.tolist()), len(eligible) / len(chosen)
 
 
 def accumulate_policy_gradient(
