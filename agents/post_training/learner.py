@@ -25,7 +25,6 @@ from agents.post_training.settings import (
 )
 from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup, gather_rows
-from agents.utils.weight_average import AveragedWeights
 from rewards import (
     RewardContext,
     RewardOutput,
@@ -285,10 +284,6 @@ class Learner:
         for part, own in zip(self.learned, state["learned_rewards"], strict=True):
             part.load_state_dict(own)
         torch.set_rng_state(state["random"])
-
-    def averaged(self) -> AveragedWeights[ScenePrior]:
-        """Context in which the prior holds the weights that are evaluated and saved: the average, when there is one."""
-        return AveragedWeights(self.prior, self.algorithm.average)
 
     def _generator(self, stream: str, index: int) -> Generator:
         return Generator().manual_seed(stream_seed(self.seed, stream, index))

@@ -271,10 +271,10 @@ class HoldState:
 
     Attributes:
         log_factor: logarithm of the factor on the weight of the regularisation.
-        iteration: of the last measurement.
-        measured: the last value; None before the first.
-        slope: its change per iteration, averaged.
-        beyond: measurements in a row that were above the target while the factor was at its upper bound.
+        iteration: iteration of the last measurement.
+        measured: last measured ratio; None before the first measurement.
+        slope: change of the ratio per iteration, averaged.
+        beyond: number of measurements in a row above the target with the factor at its upper bound.
         lost_at: iteration from which the target counts as not held; None while it counts as held.
     """
 

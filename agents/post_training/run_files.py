@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.configuration.composition import config_text, dotted
+from agents.configuration.composition import dotted
 from agents.post_training.settings import RESUMABLE
 from agents.utils.checkpoints import load_checkpoint
 from scene_envs import files
@@ -41,33 +40,6 @@ def writing(what: str, write: Callable[[], object]) -> None:
         write()
     except (OSError, RuntimeError) as error:
         raise TrainingError(f"could not write {what} ({error}); free some space and run the same again") from error
-
-
-def write_config(directory: Path, config: Mapping[str, Any]) -> None:
-    """Write ``config.yaml`` from the plain values of a configuration."""
-    write_text(directory / "config.yaml", files.sealed(config_text(config)))
-
-
-def run_metrics(
-    history: Sequence[Mapping[str, float]],
-    batch_size: int,
-    seconds: float,
-    best_reward: float,
-    guard: Mapping[str, Any],
-) -> dict[str, Any]:
-    """Content of ``metrics.json`` for a run with the log ``history``."""
-    rewards = [row["reward"] for row in history if math.isfinite(row["reward"])]
-    return {
-        "iterations": len(history),
-        "seconds": round(seconds, 1),
-        "reward": {
-            "first": rewards[0] if rewards else None,
-            "last": rewards[-1] if rewards else None,
-            "best": best_reward,
-            "invalid_scenes": round(sum((1.0 - row["valid_fraction"]) * batch_size for row in history)),
-        },
-        "guard": dict(guard),
-    }
 
 
 def write_metrics(directory: Path, metrics: Mapping[str, Any]) -> None:
@@ -148,9 +120,11 @@ def draw_curve(
     figure = Figure(figsize=(8.4, 5.2), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
-    upper.fill_between(iteration, *band(reward, spread, highest), color=REWARD_COLOR, alpha=0.12, linewidth=0)
+    upper.fill_between(
+        iteration, reward - spread, np.clip(reward + spread, None, highest), color=REWARD_COLOR, alpha=0.12, linewidth=0
+    )
     upper.plot(iteration, reward, color=REWARD_COLOR, alpha=0.35, linewidth=1, label="a batch ± std")
-    upper.plot(iteration, smooth(reward), color=REWARD_COLOR, linewidth=2.2, label="smoothed")
+    upper.plot(iteration, _smooth(reward), color=REWARD_COLOR, linewidth=2.2, label="smoothed")
     sampled = [(row["iteration"], row["guard_sample_reward"]) for row in history if "guard_sample_reward" in row]
     if sampled:
         upper.plot(*zip(*sampled, strict=True), "D", color=GUARD_COLOR, markersize=5, label="samples of the guard")
@@ -177,23 +151,8 @@ def draw_curve(
     return path
 
 
-def band(reward: np.ndarray, spread: np.ndarray, highest: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Reward minus and plus its standard deviation; the sum is at most ``highest``, the largest possible reward.
-
-    >>> low, high = band(np.array([0.9, 0.5]), np.array([0.2, 0.3]), highest=1.0)
-    >>> low.round(2).tolist(), high.round(2).tolist()
-    ([0.7, 0.2], [1.0, 0.8])
-    """
-    return reward - spread, np.clip(reward + spread, None, highest)
-
-
-def smooth(values: np.ndarray, window: int = 9) -> np.ndarray:
-    """Centred moving average over finite values, of the same length; the window shrinks at the ends.
-
-    >>> smooth(np.array([1.0, 2.0, 6.0]), window=3).tolist()
-    [1.5, 3.0, 4.0]
-    """
-    half = window // 2
+def _smooth(values: np.ndarray, half: int = 4) -> np.ndarray:
+    """Centred moving average over finite values, ``half`` to each side; the window shrinks at the ends."""
     parts = [values[max(0, i - half) : i + half + 1] for i in range(len(values))]
     return np.array([np.nanmean(part) if np.isfinite(part).any() else np.nan for part in parts])
 

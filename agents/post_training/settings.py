@@ -119,6 +119,9 @@ class ForwardProcessSettings(AlgorithmSettings):
             as they are, ``auto`` is ``none`` if poses have credit per object and the reward counts no objects, else
             ``scene``.
         sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
+        advantage_clip: advantage, in standard deviations, beyond which a sample counts as no better or worse.
+        expectation_lr: learning rate of the copy of the denoiser that learns the mean of own samples; 0 takes the
+            sampling policy for it.
     """
 
     learning_rate: ClassVar[float] = 2e-4
@@ -135,12 +138,16 @@ class ForwardProcessSettings(AlgorithmSettings):
     credit: str = "auto"
     category_credit: str = "auto"
     sampler_decay: float = 0.9
+    advantage_clip: float = 2.0
+    expectation_lr: float = 3e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_at_least(self, 1, "updates", "draws")
         require_one_of(self, "credit", CREDITS)
         require_one_of(self, "category_credit", CATEGORY_CREDITS)
+        require_positive(self, "advantage_clip")
+        require_at_least(self, 0, "expectation_lr")
         if not 0 <= self.sampler_decay < 1:
             raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
 
@@ -150,21 +157,15 @@ class NFTSettings(ForwardProcessSettings):
     """NFT: good samples pull, bad samples push, both within bounds (Zheng et al. 2025).
 
     Attributes:
-        beta: strength; smaller ones step further from the sampling policy.
-        advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
-        expectation_lr: learning rate of the copy of the denoiser that learns the mean of own samples; 0 takes the
-            sampling policy for it.
+        beta: strength; smaller values step further from the sampling policy.
     """
 
     name: str = "nft"
     beta: float = 0.5
-    advantage_clip: float = 2.0
-    expectation_lr: float = 3e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive(self, "beta", "advantage_clip")
-        require_at_least(self, 0, "expectation_lr")
+        require_positive(self, "beta")
 
 
 @dataclass
@@ -173,19 +174,13 @@ class AWMSettings(ForwardProcessSettings):
 
     Attributes:
         beta: strength of the pull to the sampling policy, above 1.
-        advantage_clip: largest advantage, in standard deviations.
-        expectation_lr: the setting of the same name of ``nft``.
     """
 
     name: str = "awm"
     beta: float = 2.0
-    advantage_clip: float = 2.0
-    expectation_lr: float = 3e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive(self, "advantage_clip")
-        require_at_least(self, 0, "expectation_lr")
         if not self.beta > 1:
             raise InvalidInputError(f"beta={self.beta} must be above 1: below, a bad sample pushes without bound")
 
@@ -226,7 +221,7 @@ class GuidanceDistillationSettings(AlgorithmSettings):
 ENTRY_POINT_GROUP = "scene_envs.algorithms"
 """Entry points of installed packages: modules that call :func:`register_algorithm` when they are imported."""
 
-Algorithm = TypeVar("Algorithm", bound=type)
+AlgorithmClass = TypeVar("AlgorithmClass", bound=type)
 
 
 @dataclass(frozen=True)
@@ -254,7 +249,7 @@ _ALGORITHMS = Registry(
 
 def register_algorithm(
     name: str, settings: type[AlgorithmSettings] = DDPOSFSettings
-) -> Callable[[Algorithm], Algorithm]:
+) -> Callable[[AlgorithmClass], AlgorithmClass]:
     """Make an algorithm available as ``algorithm=name``; the same name again replaces it.
 
     The decorated class takes ``(settings, policy, stds)`` and extends :class:`agents.post_training.Algorithm` or one
@@ -386,7 +381,7 @@ class PostTrainOptimizerSettings(OptimizerSettings):
             super().__post_init__()
 
 
-FEWEST_SAMPLES = 20
+MIN_SAMPLES = 20
 """Samples that the guard's classifier needs."""
 
 
@@ -443,9 +438,9 @@ class GuardSettings:
 
     @property
     def sampled(self) -> int:
-        """Number of scenes that a check samples, at most that of the held-out scenes; 0 below ``FEWEST_SAMPLES``."""
+        """Number of scenes that a check samples, at most that of the held-out scenes; 0 below ``MIN_SAMPLES``."""
         count = min(self.samples, self.scenes)
-        return count if count >= FEWEST_SAMPLES else 0
+        return count if count >= MIN_SAMPLES else 0
 
     def sample_limits(self, defaults: Mapping[str, float]) -> dict[str, float]:
         """Limits of figures of samples by name; ``defaults`` are the algorithm's."""

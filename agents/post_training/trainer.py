@@ -14,22 +14,22 @@ import torch
 from tensordict import TensorDict
 from torch import Generator
 
+from agents.configuration.composition import config_text
 from agents.configuration.prior_names import short_name
 from agents.post_training.algorithms.base import no_credit_per_object
 from agents.post_training.guard import Guard, GuardReading, SampleCheck, realism
 from agents.post_training.learner import Learner, NonFiniteGradient
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.real_scenes import SceneBank, kept_base_samples, kept_scenes
-from agents.post_training.rollouts import PromptSets, gathered_scenes, prompts_beside, reward_figures, stream_seed
+from agents.post_training.rollouts import PromptSets, gathered_scenes, reward_figures, run_prompts, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
     draw_curve,
     load_resumable,
-    run_metrics,
     run_progress,
-    write_config,
     write_log,
     write_metrics,
+    write_text,
     writing,
 )
 from agents.post_training.settings import PostTrainConfig
@@ -38,9 +38,10 @@ from agents.utils.checkpoints import check_tensors, save_checkpoint
 from agents.utils.interrupts import finishing_steps
 from agents.utils.loggers import make_logger
 from agents.utils.process_group import ProcessGroup, launched_processes
+from agents.utils.weight_average import AveragedWeights
 from rewards import reward_label
 from scene_envs.errors import InvalidInputError, TrainingError
-from scene_envs.files import claimed
+from scene_envs.files import claimed, sealed
 from scene_envs.scene import SceneBatch
 
 MAX_INVALID = 3
@@ -173,7 +174,7 @@ class PostTrainer:
             self._restore(state)
         else:
             if self.processes.is_first:
-                write_config(self.directory, self.plain)
+                write_text(self.directory / "config.yaml", sealed(config_text(self.plain)))
             self.guard.start(self.prior)
             self._keep(self.prior)  # the best prior so far is the base
         title = f"post-train {self.prior.scene_type.name}"
@@ -215,7 +216,7 @@ class PostTrainer:
         )
         prompts: PromptSets | None = None
         if self.prior.conditional:
-            prompts = prompts_beside(self.directory, batch, seed)
+            prompts = run_prompts(self.directory, batch, seed)
             if config.prompt == "data":
                 large = torch.nonzero(batch.counts > slots)[:, 0].tolist()
                 check_object_count([text for i in large for text in prompts(i)], self.prior.scene_type, slots)
@@ -328,7 +329,7 @@ class PostTrainer:
         recent = [row["reward"] for row in self.history[since:] if math.isfinite(row["reward"])]
         reward = sum(recent) / len(recent) if recent else float("nan")
         scenes = gathered_scenes(batch)
-        with self.learner.averaged() as prior:
+        with AveragedWeights(self.prior, self.learner.algorithm.average) as prior:
             reading = self.guard.check(prior, self.iteration, reward, realism(scenes), sample=sample)
             if reading.kept:
                 self._keep(prior)
@@ -428,9 +429,20 @@ class PostTrainer:
         self.learner.restore(state["learner"])
 
     def _finish(self) -> PostTrainResult:
-        guard = {**self.guard.summary(), "rollbacks": self.rollbacks}
-        metrics = run_metrics(self.history, self.config.batch_size, self.seconds, self.guard.best_reward, guard)
-        metrics["hold"] = self.learner.regularisation.summary()
+        rewards = [row["reward"] for row in self.history if math.isfinite(row["reward"])]
+        invalid = sum((1.0 - row["valid_fraction"]) * self.config.batch_size for row in self.history)
+        metrics = {
+            "iterations": len(self.history),
+            "seconds": round(self.seconds, 1),
+            "reward": {
+                "first": rewards[0] if rewards else None,
+                "last": rewards[-1] if rewards else None,
+                "best": self.guard.best_reward,
+                "invalid_scenes": round(invalid),
+            },
+            "guard": {**self.guard.summary(), "rollbacks": self.rollbacks},
+            "hold": self.learner.regularisation.summary(),
+        }
         if self.processes.is_first:
             write_metrics(self.directory, metrics)
             draw_curve(

@@ -11,9 +11,11 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Generator, Tensor, nn
 from torchrl.objectives import LossModule
 
+from agents.networks.text import Text
 from agents.post_training.policy import DenoisingPolicy
 from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup, gather_rows
@@ -38,9 +40,9 @@ class Algorithm(ABC):
     """Rule that turns a batch of scenes into a gradient.
 
     Attributes:
-        policy: the reverse chain of the prior in training.
-        advantage: writes what the loss reads into a batch; None where the scenes are not weighted.
-        loss: the loss that is minimised.
+        policy: reverse chain of the prior in training.
+        advantage: module that writes the advantages which the loss reads; None where the scenes are not weighted.
+        loss: torchrl loss whose gradient trains the prior.
     """
 
     policy: DenoisingPolicy
@@ -139,7 +141,12 @@ class AveragedSampler(Algorithm):
 
 
 class PlainLoss(LossModule):
-    """A torchrl loss whose gradient goes to the modules' own parameters, and which has no value estimator."""
+    """A torchrl loss whose gradient goes to the modules' own parameters, and which has no value estimator.
+
+    Its accepted keys have ``text`` and ``text_mask``.
+    """
+
+    tensor_keys: Any
 
     @property
     def functional(self) -> bool:
@@ -148,6 +155,20 @@ class PlainLoss(LossModule):
 
     def _forward_value_estimator_keys(self, **kwargs: object) -> None:
         """Do nothing, because there is no value estimator."""
+
+    def _text(self, flat: TensorDictBase) -> Text | None:
+        """The text that the network attends to, as constants; None where there is none."""
+        tokens, mask = flat.get(self.tensor_keys.text, None), flat.get(self.tensor_keys.text_mask, None)
+        return None if tokens is None or mask is None else (tokens.detach(), mask)
+
+    def _advantage(self, flat: TensorDictBase, key: NestedKey, scene: Tensor) -> Tensor:
+        """(B, 1) or (B, N) advantages of scenes (B, N, D), as constants."""
+        found: Tensor = flat[key].detach().reshape(len(scene), -1)
+        if found.shape[1] not in (1, scene.shape[1]):
+            raise InvalidInputError(
+                f"{key!r} has {found.shape[1]} values per scene; give one, or one per slot ({scene.shape[1]})"
+            )
+        return found
 
 
 class GradientSum:
@@ -293,9 +314,9 @@ def prompt_groups(final: TensorDictBase) -> Tensor | None:
     prompt = final.get("prompt", None)
     if prompt is None:
         return None
-    everywhere = gather_rows(prompt)
-    groups: Tensor = torch.unique(everywhere, dim=0, return_inverse=True)[1]
-    return groups[ProcessGroup.current().rows(len(everywhere))]
+    all_prompts = gather_rows(prompt)
+    groups: Tensor = torch.unique(all_prompts, dim=0, return_inverse=True)[1]
+    return groups[ProcessGroup.current().rows(len(all_prompts))]
 
 
 def no_credit_per_object() -> InvalidInputError:

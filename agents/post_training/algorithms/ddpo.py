@@ -131,12 +131,14 @@ class DDPOSFLoss(PlainLoss):
         flat = tensordict.reshape(-1)
         scene, action = flat.get(keys.scene).detach(), flat.get(keys.action).detach()
         timestep = flat.get(keys.timestep).reshape(-1)
-        advantage = self._advantage(flat, scene.shape[:2])
+        advantage = self._advantage(flat, keys.advantage, scene)
         old = flat.get(keys.sample_log_prob, None)
         if old is None and self.clip_epsilon is not None:
             raise InvalidInputError(f"clipping needs the log-probabilities at sampling under {keys.sample_log_prob!r}")
         kept = self._kept(tensordict)
-        text = self._text(flat)
+        text, prompt = self._text(flat), flat.get(keys.prompt, None)
+        if text is None and prompt is not None:
+            text = self.policy.read(prompt)
         total = scene.new_zeros(())
         largest, clipped = scene.new_zeros(()), scene.new_zeros(())
         for t in timestep.unique().tolist():
@@ -185,23 +187,6 @@ class DDPOSFLoss(PlainLoss):
             for step in reversed(range(shape[-1] - 1)):
                 episode[..., step] &= ends[..., step] | episode[..., step + 1]
         return (kept & episode).reshape(-1)
-
-    def _text(self, flat: TensorDictBase) -> tuple[Tensor, Tensor] | None:
-        keys = self.tensor_keys
-        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
-        if tokens is not None and mask is not None:
-            return tokens.detach(), mask
-        prompt = flat.get(keys.prompt, None)
-        return None if prompt is None else self.policy.read(prompt)
-
-    def _advantage(self, flat: TensorDictBase, shape: torch.Size) -> Tensor:
-        advantage = flat.get(self.tensor_keys.advantage).detach()
-        advantage = advantage.reshape(shape[0], -1)
-        if advantage.shape[1] not in (1, shape[1]):
-            raise InvalidInputError(
-                f"the advantage has {advantage.shape[1]} values per scene; give one, or one per slot ({shape[1]})"
-            )
-        return advantage
 
     def _count_entries(self, slots: int) -> int:
         """Divisor of log-probabilities."""

@@ -143,11 +143,11 @@ class ForwardProcessLoss(PlainLoss):
             InvalidInputError: an advantage has neither one value per scene nor one per slot.
         """
         keys = self.tensor_keys
-        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
-        text = None if tokens is None or mask is None else (tokens.detach(), mask)
-        scene = flat.get(keys.scene)
+        text, scene = self._text(flat), flat.get(keys.scene)
         advantage = self._advantage(flat, keys.advantage, scene)
-        credit = self._advantage(flat, keys.category_advantage, scene)
+        credit = scene.new_zeros(len(scene), 1)
+        if flat.get(keys.category_advantage, None) is not None:
+            credit = self._advantage(flat, keys.category_advantage, scene)
         output = self.prior.output(noised, text)
         with torch.no_grad():
             old = self.sampler.output(noised, text)
@@ -177,18 +177,6 @@ class ForwardProcessLoss(PlainLoss):
         )
         found = {"loss_objective": losses, "loss_expectation": expectation, "distance": distance.sqrt()}
         return TensorDict(found, [])
-
-    def _advantage(self, flat: TensorDictBase, key: NestedKey, scene: Tensor) -> Tensor:
-        """(B, 1) or (B, N); zeros where the key is missing."""
-        found = flat.get(key, None)
-        if found is None:
-            return scene.new_zeros(len(scene), 1)
-        found = found.detach().reshape(len(scene), -1)
-        if found.shape[1] not in (1, scene.shape[1]):
-            raise InvalidInputError(
-                f"{key!r} has {found.shape[1]} values per scene; give one, or one per slot ({scene.shape[1]})"
-            )
-        return found
 
 
 class NFTLoss(ForwardProcessLoss):
