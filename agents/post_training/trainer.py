@@ -140,7 +140,7 @@ class PostTrainer:
         base = ScenePrior.load(config.prior if prior is None else prior)
         if config.prompt is not None and not base.conditional:
             raise no_text(base.scene_type, str(config.prompt))
-        self.base_name = base.loaded_as
+        self.base_name = short_name(base.loaded_as) if base.loaded_as else ""
         self.prior = deepcopy(base).to(config.device).eval()
         policy = DenoisingPolicy(
             self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,
@@ -375,7 +375,7 @@ class PostTrainer:
             **{key: value for key, value in prior.card.items() if key not in unknown},
             "post_training": {
                 "algorithm": self.config.algorithm.name,
-                **({"base": short_name(self.base_name)} if self.base_name else {}),
+                **({"base": self.base_name} if self.base_name else {}),
                 "reward": self.plain["reward"],
                 "iteration": self.iteration,
                 "mean_reward": self.guard.best_reward if self.iteration else None,
