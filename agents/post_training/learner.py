@@ -47,47 +47,6 @@ FIRST_STEPS = 150
 """Number of optimiser steps on these samples."""
 
 
-class WholeBatchReward:
-    """A reward that depends on the other scenes of a batch, for which each process scores the scenes of all processes.
-
-    Args:
-        reward: resolved reward.
-        processes: processes that call this reward together, each with the same number of scenes.
-    """
-
-    depends_on_batch = True
-
-    def __init__(self, reward: Any, processes: ProcessGroup) -> None:
-        self._reward, self._processes = reward, processes
-        self.name = reward_name(reward)
-        self.averages_objects, self.counts_objects = averages_objects(reward), counts_objects(reward)
-
-    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Scores of ``batch``."""
-        everything = SceneBatch(gather_rows(batch.tensor), batch.scene_type)
-        prompts = context.prompts
-        if prompts is not None:
-            prompts = tuple(text for texts in self._processes.gather(tuple(prompts)) for text in texts)
-        output = evaluate_reward(self._reward, everything, replace(context, prompts=prompts))
-        rows = self._processes.rows(len(everything))
-        return replace(
-            output,
-            value=output.value[rows],
-            valid=None if output.valid is None else output.valid[rows],
-            per_object=None if output.per_object is None else output.per_object[rows],
-            terms={name: term[rows] for name, term in output.terms.items()},
-            object_flags={name: flags[rows] for name, flags in output.object_flags.items()},
-        )
-
-
-class NonFiniteGradient(Exception):
-    """An update was refused; ``figures`` describes the refused update."""
-
-    def __init__(self, figures: dict[str, float]) -> None:
-        super().__init__(str(figures))
-        self.figures = figures
-
-
 class Learner:
     """Samples scenes under the current policy and updates it. All randomness depends on (seed, purpose, iteration).
 
@@ -287,3 +246,44 @@ class Learner:
 
     def _generator(self, stream: str, index: int) -> Generator:
         return Generator().manual_seed(stream_seed(self.seed, stream, index))
+
+
+class WholeBatchReward:
+    """A reward that depends on the other scenes of a batch, for which each process scores the scenes of all processes.
+
+    Args:
+        reward: resolved reward.
+        processes: processes that call this reward together, each with the same number of scenes.
+    """
+
+    depends_on_batch = True
+
+    def __init__(self, reward: Any, processes: ProcessGroup) -> None:
+        self._reward, self._processes = reward, processes
+        self.name = reward_name(reward)
+        self.averages_objects, self.counts_objects = averages_objects(reward), counts_objects(reward)
+
+    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """Scores of ``batch``."""
+        everything = SceneBatch(gather_rows(batch.tensor), batch.scene_type)
+        prompts = context.prompts
+        if prompts is not None:
+            prompts = tuple(text for texts in self._processes.gather(tuple(prompts)) for text in texts)
+        output = evaluate_reward(self._reward, everything, replace(context, prompts=prompts))
+        rows = self._processes.rows(len(everything))
+        return replace(
+            output,
+            value=output.value[rows],
+            valid=None if output.valid is None else output.valid[rows],
+            per_object=None if output.per_object is None else output.per_object[rows],
+            terms={name: term[rows] for name, term in output.terms.items()},
+            object_flags={name: flags[rows] for name, flags in output.object_flags.items()},
+        )
+
+
+class NonFiniteGradient(Exception):
+    """An update was refused; ``figures`` describes the refused update."""
+
+    def __init__(self, figures: dict[str, float]) -> None:
+        super().__init__(str(figures))
+        self.figures = figures

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
+from agents.post_training.guard import realism
 from agents.post_training.rollouts import PromptDeck, run_prompts, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
@@ -227,7 +228,6 @@ def measure_prior(
         slots: slots per sample; None takes as many as the prior was trained on.
         reward: reward that the run trains with, as :func:`rewards.process.run_reward` gives it; None measures none.
     """
-    from agents.post_training.guard import realism
     from scene_envs.physics import feasibility, make_ready
 
     raw = prior.sample(
@@ -236,13 +236,16 @@ def measure_prior(
     )  # fmt: skip
     feasible = feasibility(raw, pool=pool)
     ready = make_ready(raw, pool=pool)
+    context = RewardContext(None if prompts is None else tuple(prompts), pool)
+    scored = None if reward is None else evaluate_reward(reward, raw, context)
     counts = raw.counts.double()
     free = raw.is_free.sum(dim=-1).double()
     figures = {
         "scenes": float(count),
         "objects": float(counts.mean()),
         "objects_sem": _standard_error(counts),
-        **({} if reward is None else _reward_figures(raw, reward, prompts, pool)),
+        **({} if scored is None else _mean("reward", scored)),
+        **({} if scored is None else {"reward_invalid": float((~scored.is_valid).sum())}),
         **_counted("feasible", feasible.counts, feasible.valid, free),
         **_counted("ready", ready.counts, ready.valid, free),
         "invalid_scenes": float((~(feasible.valid & ready.valid)).sum()),
@@ -263,14 +266,6 @@ def _counted(name: str, counts: Tensor, valid: Tensor, free: Tensor) -> dict[str
         f"{name}_objects_sem": _standard_error(taken),
         f"{name}_fraction": share,
     }
-
-
-def _reward_figures(
-    batch: SceneBatch, reward: Any, prompts: Sequence[str] | None, pool: PhysicsPool | None
-) -> dict[str, float]:
-    """Mean of ``reward`` over the scenes that it can score, and the number of the others."""
-    output = evaluate_reward(reward, batch, RewardContext(None if prompts is None else tuple(prompts), pool))
-    return {**_mean("reward", output), "reward_invalid": float((~output.is_valid).sum())}
 
 
 def _mean(name: str, output: RewardOutput) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Configuration of one post-training run; imports no torch."""
+"""Settings of post-training, registry of algorithms, and configuration of a run; imports no torch."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class AlgorithmSettings:
     regularisation_weight: ClassVar[float] = 0.5
     """Coefficient of the pretraining loss unless ``regularisation.weight`` names another."""
     sample_limits: ClassVar[Mapping[str, float]] = {}
-    """Limits of the guard's sample figures unless ``guard`` names others; a reward may ask for other object counts."""
+    """Limits of the guard's figures of samples unless ``guard.limits`` names others."""
 
     name: str = ""
     scenes_per_prompt: int = 8

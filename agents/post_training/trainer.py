@@ -227,7 +227,7 @@ class PostTrainer:
         if not reuse_scenes:
             self._try_reward(batch, prompts)
         base = self.learner.regularisation.base
-        if base is not None and config.regularisation.objective == "discriminative":
+        if base is not None:
             samples = kept_base_samples(
                 self.directory, base, self.scenes, config.regularisation.base_samples, config.seed,
                 num_steps=config.num_steps, batch_size=config.batch_size, reuse=reuse_scenes, progress=shown,
