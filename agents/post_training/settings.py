@@ -119,7 +119,7 @@ class ForwardProcessSettings(AlgorithmSettings):
             as they are, ``auto`` is ``none`` if poses have credit per object and the reward counts no objects, else
             ``scene``.
         sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
-        advantage_clip: advantage, in standard deviations, beyond which a sample counts as no better or worse.
+        advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
         expectation_lr: learning rate of the copy of the denoiser that learns the mean of own samples; 0 takes the
             sampling policy for it.
     """
