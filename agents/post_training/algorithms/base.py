@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
@@ -280,6 +281,47 @@ class Advantage(TensorDictModuleBase):
             raise no_credit_per_object()
         credited = final.get("credited", torch.ones_like(per_object, dtype=torch.bool))
         return per_object.float(), credited & valid[:, None]
+
+
+class ForwardAdvantage(Advantage):
+    """Writes advantages that are not clipped, of poses and of categories.
+
+    Reads, in addition to the keys of :class:`Advantage`:
+        judged: (B, S, N) bool, optional. Slots that the reward does not judge have no advantage of their own: a table
+            of credit 0 would otherwise be repelled like an object that is not feasible.
+        counts_objects: (B, S, 1) bool, optional, whether the reward depends on which objects there are.
+
+    Writes, in addition:
+        category_advantage: (B, S, 1), the scene's advantage, or zeros for no credit.
+
+    Args:
+        credit: ``"scene"``, ``"object"`` or ``"auto"``, for poses.
+        category_credit: ``"scene"``, ``"none"``, or ``"auto"``: none where poses have credit per object and the reward
+            does not count objects.
+    """
+
+    out_keys = ["advantage", "category_advantage", "valid"]  # noqa: RUF012
+
+    def __init__(self, *, credit: str = "auto", category_credit: str = "auto") -> None:
+        super().__init__(credit=credit, clip=math.inf)
+        self.category_credit = category_credit
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``out_keys``."""
+        final = super().forward(tensordict)[:, -1]
+        per_object = self.credited(final)[0].ndim == 2
+        poses_alone = per_object and not bool(final.get("counts_objects", torch.zeros(1)).any())
+        if self.category_credit == "none" or (self.category_credit == "auto" and poses_alone):
+            categories = torch.zeros_like(final["advantage"][:, 0])
+        else:
+            categories = compute_advantages(*final_reward(final), clip=math.inf, groups=prompt_groups(final))
+        return tensordict.set("category_advantage", at_all_steps(categories, tensordict))
+
+    def credited(self, final: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Rewards of slots that are judged, or of scenes."""
+        reward, valid = super().credited(final)
+        judged = final.get("judged", None)
+        return reward, valid if reward.ndim == 1 or judged is None else valid & judged
 
 
 def last_steps(episodes: TensorDictBase) -> TensorDictBase:
