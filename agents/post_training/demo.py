@@ -61,7 +61,7 @@ def run_demo(
         progress: style of the progress display of both runs, as in :class:`~scene_envs.progress.Progress`.
         scenes: number of fresh samples of each prior.
         num_steps: denoiser evaluations per measured sample.
-        runs: names of the runs, and their keys of ``post-train`` besides output, seed and workers.
+        runs: names of the runs, and their keys of ``post-train`` in addition to output, seed and workers.
 
     Returns:
         The numbers of ``metrics.json``: those of ``measure_prior`` for ``base`` and each run, ``runs`` (the metrics of

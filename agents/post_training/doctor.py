@@ -14,7 +14,7 @@ from agents.configuration.composition import changed
 from agents.post_training.algorithms.base import final_reward, gradient_norm
 from agents.post_training.algorithms.ddpo import DDPOSFLoss, accumulate_policy_gradient
 from agents.post_training.learner import Learner
-from agents.post_training.settings import GuidanceDistillationSettings, PostTrainConfig
+from agents.post_training.settings import AlgorithmSettings, GuidanceDistillationSettings, PostTrainConfig
 from agents.post_training.trainer import PostTrainer
 from agents.priors.prior import ScenePrior
 
@@ -140,7 +140,9 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
         update_seconds=updated - sampled,
         iterations=trainer.config.iterations,
     )
-    return replace(report, advice=_advice(report, trainer.config))
+    config = trainer.config
+    weight = config.regularisation.pretraining_weight
+    return replace(report, advice=_advice(report, config.algorithm, weight, config.prompt is not None))
 
 
 def _step_rows(learner: Learner, batch: TensorDictBase) -> tuple[list[StepRow], float]:
@@ -162,7 +164,7 @@ def _step_rows(learner: Learner, batch: TensorDictBase) -> tuple[list[StepRow], 
     return rows, largest
 
 
-def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
+def _advice(report: DoctorReport, algorithm: AlgorithmSettings, weight: float, prompted: bool) -> list[str]:
     advice = []
     if report.log_ratio != 0:
         advice.append(
@@ -171,18 +173,17 @@ def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
         )
     if report.valid_fraction < 1:
         advice.append(f"{1 - report.valid_fraction:.0%} of the scenes have no valid reward; see the log for why.")
-    rewarded = not isinstance(config.algorithm, GuidanceDistillationSettings)
+    rewarded = not isinstance(algorithm, GuidanceDistillationSettings)
     if rewarded and report.valid_fraction > 0 and not report.reward_std > 0:
         advice.append("All rewards are equal: there is nothing to learn from. Use a graded reward or more scenes.")
     if rewarded and report.reward_std > 0 and report.policy_gradient_norm == 0:
-        together = config.algorithm.scenes_per_prompt
         advice.append(
-            "The rewards differ, but no advantage does: there is nothing to learn. Another algorithm.credit may help."
-            if config.prompt is None
-            else "The rewards differ between prompts but not within any: there is nothing to learn. Raise "
-            f"scenes_per_prompt from {together}, or use a reward that differs between scenes of one prompt."
+            "The rewards differ between prompts but not within any: there is nothing to learn. Raise scenes_per_prompt "
+            f"from {algorithm.scenes_per_prompt}, or use a reward that differs between scenes of one prompt."
+            if prompted
+            else "The rewards differ, but no advantage does: there is nothing to learn. Another algorithm.credit may "
+            "help."
         )
-    weight = config.regularisation.pretraining_weight
     if weight > 0 and report.policy_gradient_norm > 0:
         if report.gradient_ratio < MIN_RATIO:
             advice.append(

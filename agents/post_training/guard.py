@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from agents.post_training.algorithms.base import prompted_loss
 from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup
 from agents.utils.seeds import derived_seed
@@ -21,6 +20,182 @@ _AT_ONCE = 32
 """Number of scenes sampled together."""
 _CLASSIFIERS = 3
 """Number of classifiers over which the accuracy is averaged."""
+_CHUNK = 256
+"""Number of held-out scenes with prompts per pass."""
+
+
+class Guard:
+    """Monitor of the held-out pretraining loss and of samples, which selects the best checkpoint within all limits.
+
+    The best checkpoint has the largest reward among the checks within all limits. If the guard samples, the reward of a
+    check is that of the samples, which start from the same noise at every check. Checks of the loss alone then keep no
+    checkpoint. Otherwise the reward of a check is the mean over all batches since the previous check, because single
+    batches are too noisy. If the reward learns, its network differs from check to check, so its values cannot be
+    compared. The best checkpoint is then the one at which the classifier, trained anew at each check, is least accurate
+    in telling samples from real scenes.
+
+    Args:
+        heldout: (K, N, D) normalised real scenes that are not used by the regularisation.
+        limit: largest ratio before the run counts as over-optimised; no checkpoint above it is kept.
+        seed: seed of the fixed timesteps and noise.
+        prompts: one prompt of each held-out scene; None measures without prompts.
+        samples: settings for sampling and measuring; None measures the loss alone.
+        limits: largest excess of each figure of samples over that of the base prior, by name.
+        target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
+        learns: whether the reward learns during the run.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior()
+    >>> guard = Guard(prior.sample_tensor(4, num_steps=2), limit=1.5, seed=0)
+    >>> guard.start(prior)
+    >>> guard.check(prior, 10, reward=1.0).ratio
+    1.0
+    """
+
+    def __init__(
+        self,
+        heldout: Tensor,
+        limit: float,
+        seed: int,
+        prompts: Sequence[str] | None = None,
+        samples: SampleCheck | None = None,
+        limits: Mapping[str, float] | None = None,
+        target: float = math.inf,
+        learns: bool = False,
+    ) -> None:
+        self.heldout = heldout
+        self.prompts = prompts
+        self.limit, self.target = limit, target
+        self.learns = learns
+        self.seed = seed
+        self.samples = samples
+        self.limits = dict(limits or {})
+        self.base_loss = float("nan")
+        self.base_figures: dict[str, float] = {}
+        self.last_samples: SceneBatch | None = None
+        self.readings: list[GuardReading] = []
+        self.best_reward = self.best_score = float("-inf")
+        self.best_iteration = 0
+
+    def start(self, base: ScenePrior) -> None:
+        """Measure the base prior."""
+        self.base_loss, self.base_figures = self._measure(base, sample=True)
+        if self.base_figures:
+            reward = self.base_figures["sample_reward"]
+            self.best_reward = float("-inf") if math.isnan(reward) else reward  # so that every reward is larger
+            self.best_score = self._score(self.best_reward, self.base_figures)
+
+    def _score(self, reward: float, figures: Mapping[str, float]) -> float:
+        """Score by which checkpoints are compared; larger is better."""
+        return -figures["classifier_accuracy"] if self.learns and figures else reward
+
+    def _measure(self, prior: ScenePrior, sample: bool) -> tuple[float, dict[str, float]]:
+        """The loss, and figures of samples if the guard samples; all processes get the values of the first process."""
+        check = self.samples if sample else None
+        batch = None if check is None else check.sample(prior)
+        if batch is not None:
+            self.last_samples = batch
+
+        def measured() -> tuple[float, dict[str, float]]:
+            return self.loss(prior), {} if check is None or batch is None else check.figures(batch)
+
+        return ProcessGroup.current().from_first(measured)
+
+    @torch.no_grad()
+    def loss(self, prior: ScenePrior) -> float:
+        """Pretraining loss on the held-out scenes; the same timesteps and noise at every call."""
+        from agents.pretraining.trainer import heldout_loss
+
+        device = next(prior.parameters()).device
+        if self.prompts is not None:
+            generator = Generator().manual_seed(self.seed)
+            chunks = [self.prompts[start : start + _CHUNK] for start in range(0, len(self.heldout), _CHUNK)]
+            losses = [
+                prior.pretraining_loss(x0.to(device), generator, "none", text=prior.encode_prompts(prompts))
+                for x0, prompts in zip(self.heldout.split(_CHUNK), chunks, strict=True)
+            ]
+            return float(torch.cat(losses).mean())
+        return heldout_loss(prior, self.heldout.to(device), seed=self.seed)
+
+    def check(
+        self,
+        prior: ScenePrior,
+        iteration: int,
+        reward: float,
+        realism: dict[str, float] | None = None,
+        *,
+        sample: bool = True,
+    ) -> GuardReading:
+        """Measure ``prior``; the reading says whether it is the best so far.
+
+        Args:
+            prior: prior with the weights that are evaluated and saved.
+            iteration: number of the finished iteration.
+            reward: mean over the batches since the check before.
+            realism: further figures, kept with the reading.
+            sample: whether this check samples; ignored if the guard never samples.
+        """
+        loss, figures = self._measure(prior, sample)
+        ratio = loss / self.base_loss
+        over = [] if ratio <= self.limit else ["loss"]
+        if figures:
+            reward = figures["sample_reward"]
+            over += beyond(figures, self.base_figures, self.limits)
+        counts = self.samples is None or sample
+        score = self._score(reward, figures)
+        kept = counts and not over and ratio <= self.target and score > self.best_score  # False for NaN
+        reading = GuardReading(iteration, loss, ratio, reward, realism or {}, kept, figures, tuple(over))
+        self.readings.append(reading)
+        if kept:
+            self.best_reward, self.best_score, self.best_iteration = reward, score, iteration
+        return reading
+
+    @property
+    def ratio(self) -> float:
+        """Ratio at the last check; 1 before the first."""
+        return self.readings[-1].ratio if self.readings else 1.0
+
+    @property
+    def best_ratio(self) -> float:
+        """Ratio of the best checkpoint; 1 when that is still the base prior."""
+        return next((r.ratio for r in self.readings if r.iteration == self.best_iteration), 1.0)
+
+    @property
+    def over_limit_at(self) -> int | None:
+        """Iteration of the first check beyond a limit, from which the reward counts as over-optimised, or None."""
+        return next((r.iteration for r in self.readings if r.beyond), None)
+
+    def summary(self) -> dict[str, Any]:
+        """Summary as JSON values: ratio of the kept checkpoint, first check beyond a limit, limits, and all checks."""
+        return {
+            "ratio": self.best_ratio,
+            "last_ratio": self.ratio,
+            "limit": self.limit,
+            "base_loss": self.base_loss,
+            "base_samples": self.base_figures,
+            "sample_limits": self.limits,
+            "best_iteration": self.best_iteration,
+            "over_optimised_from": self.over_limit_at,
+            "checks": [vars(reading) for reading in self.readings],
+        }
+
+    def state(self) -> dict[str, Any]:
+        """State for a checkpoint."""
+        return {
+            "base_loss": self.base_loss,
+            "base_samples": self.base_figures,
+            "readings": [dict(vars(reading)) for reading in self.readings],
+            "best_reward": self.best_reward,
+            "best_score": self.best_score,
+            "best_iteration": self.best_iteration,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        self.base_loss, self.base_figures = state["base_loss"], state["base_samples"]
+        self.readings = [GuardReading(**reading) for reading in state["readings"]]
+        self.best_reward, self.best_iteration = state["best_reward"], state["best_iteration"]
+        self.best_score = state["best_score"]
 
 
 @dataclass(frozen=True)
@@ -117,9 +292,6 @@ def beyond(figures: Mapping[str, float], base: Mapping[str, float], limits: Mapp
     return [name for name in measured if not figures[name] <= base[name] + limits[name]]
 
 
-_CHUNK = 256
-
-
 @dataclass(frozen=True)
 class GuardReading:
     """Result of one check.
@@ -143,183 +315,6 @@ class GuardReading:
     kept: bool = False
     samples: dict[str, float] = field(default_factory=dict)
     beyond: tuple[str, ...] = ()
-
-
-class Guard:
-    """Monitor of the held-out pretraining loss and of samples, which selects the best checkpoint within all limits.
-
-    The best checkpoint has the largest reward among the checks within all limits. If the guard samples, the reward of a
-    check is that of the samples, which start from the same noise at every check. Checks of the loss alone then keep no
-    checkpoint. Otherwise the reward of a check is the mean over all batches since the previous check, because single
-    batches are too noisy. If the reward learns, its network differs from check to check, so its values cannot be
-    compared. The best checkpoint is then the one at which the classifier, trained anew at each check, is least accurate
-    in telling samples from real scenes.
-
-    Args:
-        heldout: (K, N, D) normalised real scenes that are not used by the regularisation.
-        limit: largest ratio before the run counts as over-optimised; no checkpoint above it is kept.
-        seed: seed of the fixed timesteps and noise.
-        prompts: one prompt of each held-out scene; None measures without prompts.
-        samples: settings for sampling and measuring; None measures the loss alone.
-        limits: largest excess of each figure of samples over that of the base prior, by name.
-        target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
-        learns: whether the reward learns during the run.
-
-    >>> from agents.priors.testing import tiny_prior
-    >>> prior = tiny_prior()
-    >>> guard = Guard(prior.sample_tensor(4, num_steps=2), limit=1.5, seed=0)
-    >>> guard.start(prior)
-    >>> guard.check(prior, 10, reward=1.0).ratio
-    1.0
-    """
-
-    def __init__(
-        self,
-        heldout: Tensor,
-        limit: float,
-        seed: int,
-        prompts: Sequence[str] | None = None,
-        samples: SampleCheck | None = None,
-        limits: Mapping[str, float] | None = None,
-        target: float = math.inf,
-        learns: bool = False,
-    ) -> None:
-        self.heldout = heldout
-        self.prompts = prompts
-        self.limit, self.target = limit, target
-        self.learns = learns
-        self.seed = seed
-        self.samples = samples
-        self.limits = dict(limits or {})
-        self.base_loss = float("nan")
-        self.base_figures: dict[str, float] = {}
-        self.last_samples: SceneBatch | None = None
-        self.readings: list[GuardReading] = []
-        self.best_reward = self.best_score = float("-inf")
-        self.best_iteration = 0
-
-    def start(self, base: ScenePrior) -> None:
-        """Measure the base prior."""
-        self.base_loss, self.base_figures = self._measure(base, sample=True)
-        if self.base_figures:
-            self.best_reward = _number(self.base_figures["sample_reward"])
-            self.best_score = self._score(self.best_reward, self.base_figures)
-
-    def _score(self, reward: float, figures: Mapping[str, float]) -> float:
-        """Score by which checkpoints are compared; larger is better."""
-        return -figures["classifier_accuracy"] if self.learns and figures else reward
-
-    def _measure(self, prior: ScenePrior, sample: bool) -> tuple[float, dict[str, float]]:
-        """The loss, and figures of samples if the guard samples; all processes get the values of the first process."""
-        check = self.samples if sample else None
-        batch = None if check is None else check.sample(prior)
-        if batch is not None:
-            self.last_samples = batch
-
-        def measured() -> tuple[float, dict[str, float]]:
-            return self.loss(prior), {} if check is None or batch is None else check.figures(batch)
-
-        return ProcessGroup.current().from_first(measured)
-
-    @torch.no_grad()
-    def loss(self, prior: ScenePrior) -> float:
-        """Pretraining loss on the held-out scenes; the same timesteps and noise at every call."""
-        from agents.pretraining.trainer import heldout_loss
-
-        device = next(prior.parameters()).device
-        if self.prompts is not None:
-            generator = Generator().manual_seed(self.seed)
-            losses = [
-                prompted_loss(prior, x0.to(device), self.prompts[start : start + _CHUNK], generator)
-                for start, x0 in zip(range(0, len(self.heldout), _CHUNK), self.heldout.split(_CHUNK), strict=True)
-            ]
-            return float(torch.cat(losses).mean())
-        return heldout_loss(prior, self.heldout.to(device), seed=self.seed)
-
-    def check(
-        self,
-        prior: ScenePrior,
-        iteration: int,
-        reward: float,
-        realism: dict[str, float] | None = None,
-        *,
-        sample: bool = True,
-    ) -> GuardReading:
-        """Measure ``prior``; the reading says whether it is the best so far.
-
-        Args:
-            prior: prior with the weights that are evaluated and saved.
-            iteration: number of the finished iteration.
-            reward: mean over the batches since the check before.
-            realism: further figures, kept with the reading.
-            sample: whether this check samples; ignored if the guard never samples.
-        """
-        loss, figures = self._measure(prior, sample)
-        ratio = loss / self.base_loss
-        over = [] if ratio <= self.limit else ["loss"]
-        if figures:
-            reward = figures["sample_reward"]
-            over += beyond(figures, self.base_figures, self.limits)
-        counts = self.samples is None or sample
-        score = self._score(reward, figures)
-        kept = counts and not over and ratio <= self.target and score > self.best_score  # False for NaN
-        reading = GuardReading(iteration, loss, ratio, reward, realism or {}, kept, figures, tuple(over))
-        self.readings.append(reading)
-        if kept:
-            self.best_reward, self.best_score, self.best_iteration = reward, score, iteration
-        return reading
-
-    @property
-    def ratio(self) -> float:
-        """Ratio at the last check; 1 before the first."""
-        return self.readings[-1].ratio if self.readings else 1.0
-
-    @property
-    def best_ratio(self) -> float:
-        """Ratio of the best checkpoint; 1 when that is still the base prior."""
-        return next((r.ratio for r in self.readings if r.iteration == self.best_iteration), 1.0)
-
-    @property
-    def over_limit_at(self) -> int | None:
-        """Iteration of the first check beyond a limit, from which the reward counts as over-optimised, or None."""
-        return next((r.iteration for r in self.readings if r.beyond), None)
-
-    def summary(self) -> dict[str, Any]:
-        """Summary as JSON values: ratio of the kept checkpoint, first check beyond a limit, limits, and all checks."""
-        return {
-            "ratio": self.best_ratio,
-            "last_ratio": self.ratio,
-            "limit": self.limit,
-            "base_loss": self.base_loss,
-            "base_samples": self.base_figures,
-            "sample_limits": self.limits,
-            "best_iteration": self.best_iteration,
-            "over_optimised_from": self.over_limit_at,
-            "checks": [vars(reading) for reading in self.readings],
-        }
-
-    def state(self) -> dict[str, Any]:
-        """State for a checkpoint."""
-        return {
-            "base_loss": self.base_loss,
-            "base_samples": self.base_figures,
-            "readings": [dict(vars(reading)) for reading in self.readings],
-            "best_reward": self.best_reward,
-            "best_score": self.best_score,
-            "best_iteration": self.best_iteration,
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Inverse of :meth:`state`."""
-        self.base_loss, self.base_figures = state["base_loss"], state["base_samples"]
-        self.readings = [GuardReading(**reading) for reading in state["readings"]]
-        self.best_reward, self.best_iteration = state["best_reward"], state["best_iteration"]
-        self.best_score = state["best_score"]
-
-
-def _number(value: float) -> float:
-    """``value``; NaN becomes -inf, so that every reward is larger."""
-    return value if value == value else float("-inf")
 
 
 def realism(batch: SceneBatch) -> dict[str, float]:

@@ -150,18 +150,12 @@ class DenoisingPolicy(TensorDictModuleBase):
         """Number of random variables that a step of the chain draws for a scene; the other entries are known."""
         return self.distribution(self.prior.initial(1, slots, None), 0).entries
 
+    @torch.no_grad()
     def stds(self, slots: int) -> Tensor:
         """(S,) smallest sigma of every step over its random entries, normalised units; 0 where none is random."""
-        smallest = [
-            std[std > 0].amin() if bool((std > 0).any()) else std.new_zeros(())
-            for std in (step.std for step in self._steps(slots))
-        ]
-        return torch.stack(smallest)
-
-    @torch.no_grad()
-    def _steps(self, slots: int) -> list[ReverseStep]:
         x = self.prior.initial(1, slots, None)
-        return [self.distribution(x, step) for step in range(len(self))]
+        stds = [self.distribution(x, step).std for step in range(len(self))]
+        return torch.stack([std[std > 0].amin() if bool((std > 0).any()) else std.new_zeros(()) for std in stds])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write an action and its log-probability; rows may be at different steps."""

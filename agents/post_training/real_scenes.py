@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 
 from agents.post_training.rollouts import PROMPTS_NAME, PromptSets, save_prompts, stream_seed
 from agents.post_training.run_files import BASE_SAMPLES_NAME, SCENES_NAME, writing
-from agents.post_training.settings import PostTrainConfig, RegularisationSettings
+from agents.post_training.settings import RegularisationSettings
 from agents.priors.prior import ScenePrior, asked_objects
 from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
@@ -22,7 +22,7 @@ from scene_envs.scene_types import SceneType
 
 _WITHHELD = 0.1
 """Share of real scenes whose prompt is withheld, as in pretraining."""
-_DRAWN = 64
+_AT_ONCE = 64
 """Number of scenes of the grammar between two updates of the progress."""
 
 
@@ -115,12 +115,7 @@ def kept_scenes(
 ) -> SceneBatch:
     """The real scenes of a run, kept in its folder with the prompts of a dataset; the first process draws them.
 
-    Args:
-        directory: folder of the run.
-        prior, seed, slots: the arguments of :func:`real_scenes`.
-        settings: source and number of the scenes.
-        reuse: load the scenes that are already in the folder, as a resumed run does.
-        progress: a style of :class:`~scene_envs.progress.Progress`.
+    ``reuse`` loads those that are already in the folder, as a resumed run does.
     """
     path, texts, processes = directory / SCENES_NAME, directory / PROMPTS_NAME, ProcessGroup.current()
     if processes.is_first and not (reuse and path.exists()):
@@ -154,8 +149,8 @@ def real_scenes(
 
         rng, grammar, parts, title = np.random.default_rng(seed), get_grammar(prior.scene_type), [], "real scenes"
         with Progress(title, count, style=progress) as shown:
-            for first in range(0, count, _DRAWN):
-                parts.append(grammar.sample(rng, min(_DRAWN, count - first)))
+            for first in range(0, count, _AT_ONCE):
+                parts.append(grammar.sample(rng, min(_AT_ONCE, count - first)))
                 done = first + len(parts[-1])
                 shown.update(done, "", f"{title} {done}/{count}")
         return SceneBatch.concatenate(parts).with_slots(slots), None
@@ -173,25 +168,21 @@ def kept_base_samples(
     directory: Path,
     base: ScenePrior,
     bank: SceneBank,
-    config: PostTrainConfig,
+    count: int,
+    seed: int,
     *,
+    num_steps: int,
+    batch_size: int,
     reuse: bool,
     progress: str = "none",
 ) -> PromptedScenes:
     """The base prior's samples of a run, kept in its folder; the first process draws them.
 
     The samples have the prompts of real scenes, so that prompts do not distinguish samples from real scenes.
-
-    Args:
-        directory: folder of the run.
-        base: the base prior.
-        bank: real scenes, which give the prompts and the number of slots.
-        config: configuration of the run.
-        reuse: load the samples that are already in the folder, as a resumed run does.
-        progress: a style of :class:`~scene_envs.progress.Progress`.
+    ``reuse`` loads those that are already in the folder, as a resumed run does.
     """
-    path, processes, count = directory / BASE_SAMPLES_NAME, ProcessGroup.current(), config.regularisation.base_samples
-    prompts = bank.batch(count, Generator().manual_seed(stream_seed(config.seed, "base_prompts"))).prompts
+    path, processes = directory / BASE_SAMPLES_NAME, ProcessGroup.current()
+    prompts = bank.batch(count, Generator().manual_seed(stream_seed(seed, "base_prompts"))).prompts
     if processes.is_first and not (reuse and path.exists()):
         with Progress("base samples", count, style=progress, always=(0,)) as shown:
             shown.update(0, "", f"drawing {count} samples of the base prior")
@@ -199,10 +190,10 @@ def kept_base_samples(
                 count,
                 prompt=prompts,
                 physics_guidance=0.0,
-                num_steps=config.num_steps,
+                num_steps=num_steps,
                 slots=bank.train.shape[1],
-                seed=stream_seed(config.seed, "base_samples"),
-                batch_size=config.batch_size,
+                seed=stream_seed(seed, "base_samples"),
+                batch_size=batch_size,
             )
         writing(f"the base prior's samples {str(path)!r}", lambda: batch.save(path))
     processes.wait()

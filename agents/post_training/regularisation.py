@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
+from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -12,68 +14,33 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from agents.networks.text import Text
-from agents.post_training.algorithms.base import SceneLoss, add_regularisation_gradient
+from agents.post_training.algorithms.base import GradientSum, gradient_norm
 from agents.post_training.real_scenes import PromptedScenes
-from agents.post_training.settings import (
-    FAR,
-    HIGHEST,
-    SHARPNESS,
-    HoldState,
-    RegularisationSettings,
-    adjust,
-    relative_error,
-)
+from agents.post_training.settings import RegularisationSettings
 from agents.priors.prior import NoisedScenes, ScenePrior
-
-
-@dataclass(frozen=True)
-class DiscriminativeLoss:
-    """Direct discriminative optimisation (Zheng et al. 2025, arXiv 2503.01103) of a diffusion prior.
-
-    The log-likelihood ratio of the prior and its base is the logit of a discriminator of real scenes and samples of the
-    base prior, which is trained with the logistic loss. The odds of the best discriminator are the density of real
-    scenes divided by that of base samples, so the best prior has the density of real scenes. The pretraining loss l of
-    a noised scene takes the place of -log p. With the gap d = l(base) - l(prior), the losses are
-
-        (2 / s) softplus(-s d) of real scenes,    (2 / s) softplus(s d) of base samples
-
-    At the base prior, their gradients are those of l and of -l. The gradient of a real scene vanishes where s d is
-    large, and that of a base sample where -s d is large. So no sample repels without bound. Where base samples are like
-    real scenes, the two gradients cancel in the mean.
-
-    Attributes:
-        prior: prior in training.
-        base: base prior, with which the prior is compared; its weights get no gradient.
-        sharpness: factor s, per unit of the pretraining loss; near 0 the loss of base samples has no bound.
-
-    >>> from agents.priors.testing import tiny_prior
-    >>> prior = tiny_prior("dimsum_table", process="mixed")
-    >>> noised = prior.noised(prior.encode(prior.sample(2, num_steps=3)))
-    >>> loss = DiscriminativeLoss(prior, prior, sharpness=20.0)
-    >>> [round(value, 4) for value in loss.of_base(noised).tolist()]  # (2 / s) log 2
-    [0.0693, 0.0693]
-    """
-
-    prior: ScenePrior
-    base: ScenePrior
-    sharpness: float
-
-    def of_real(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
-        """(B,) losses of noised real scenes."""
-        return F.softplus(-self.sharpness * self.gap(noised, text)) * (2 / self.sharpness)
-
-    def of_base(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
-        """(B,) losses of noised samples of the base prior."""
-        return F.softplus(self.sharpness * self.gap(noised, text)) * (2 / self.sharpness)
-
-    def gap(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
-        """(B,) pretraining losses of the base prior minus those of the prior in training."""
-        with torch.no_grad():
-            base = self.base.noised_loss(noised, text)
-        return base - self.prior.noised_loss(noised, text)
-
+from agents.utils.process_group import ProcessGroup
 
 logger = logging.getLogger(__name__)
+
+SHARPNESS = 20.0
+"""Scale of the discriminative loss; with a larger value the prior moves less far from its base."""
+MIN_FACTOR, MAX_FACTOR = 0.01, 100.0
+"""Bounds of the factor on the weight."""
+GAIN = 0.05
+"""Change of the factor's logarithm per iteration if the figure's excess over its base value is twice the target's."""
+LOOK_AHEAD = 30.0
+"""Iterations by which a measurement is extrapolated, because the weights act with a delay."""
+SMOOTHING = 10.0
+"""Iterations over which the figure's change per iteration is averaged."""
+MAX_ERROR = 3.0
+"""Bound of the relative error that the factor follows."""
+MAX_FINAL_ERROR = 0.5
+"""Relative error of the last measurement above which the target counts as not held at the end."""
+PATIENCE = 3
+"""Measurements in a row above the target, with the factor at its upper bound, after which the target is not held."""
+
+SceneLoss = Callable[[NoisedScenes, Text | None], Tensor]
+"""(B,) losses of noised scenes and their prompts."""
 
 
 class Regularisation:
@@ -159,7 +126,7 @@ class Regularisation:
         state, settings = self.state, self.settings
         if self.target is None or state.measured is None:
             return ""
-        if state.lost_at is None and relative_error(self.target, state.measured) > FAR:
+        if state.lost_at is None and relative_error(self.target, state.measured) > MAX_FINAL_ERROR:
             return (
                 f"hold={settings.hold} was not held at the end: guard {state.measured:.4g} at the last measurement, "
                 f"when the weight of the regularisation was {state.factor:.3g} times the first one and still rising; "
@@ -169,7 +136,7 @@ class Regularisation:
             return f"hold={settings.hold} was held: guard {state.measured:.4g} at the last measurement."
         return (
             f"hold={settings.hold} could not be held: at iteration {state.lost_at} the weight of the regularisation "
-            f"was at its bound, {HIGHEST:g} times the first one, and the held-out loss was still above the target "
+            f"was at its bound, {MAX_FACTOR:g} times the first one, and the held-out loss was still above the target "
             f"({state.measured:.4g} at the last measurement); lower optimizer.lr, raise the weight, or allow more"
         )
 
@@ -192,3 +159,167 @@ class Regularisation:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`."""
         self.state = HoldState(**state)
+
+
+def add_regularisation_gradient(
+    prior: ScenePrior,
+    x0: Tensor,
+    coefficient: float,
+    generator: Generator,
+    *,
+    loss: SceneLoss | None = None,
+    chunk: int | None = None,
+    prompts: Sequence[str] | None = None,
+) -> tuple[float, float]:
+    """Add ``coefficient`` times the gradient of a loss of noised scenes to ``.grad``.
+
+    Args:
+        prior: the prior in training.
+        x0: (B, N, D) normalised scenes of all processes; each process takes its share of them.
+        coefficient: coefficient of the loss, which is a mean over scenes and entries.
+        generator: source of timesteps and noise (CPU).
+        loss: (B,) losses of noised scenes; None for the pretraining loss.
+        chunk: number of scenes per pass.
+        prompts: one prompt per scene, ``""`` for a scene without one; None for a prior that reads no prompts.
+
+    Returns:
+        The mean loss of all scenes, and the norm of ``coefficient`` times its gradient.
+    """
+    if coefficient == 0:
+        return 0.0, 0.0
+    processes, parameters = ProcessGroup.current(), [p for p in prior.parameters() if p.requires_grad]
+    before = [p.grad for p in parameters]
+    for parameter in parameters:
+        parameter.grad = None
+    value, total = 0.0, GradientSum(parameters)
+    noised, own = prior.noised(x0, generator), processes.rows(len(x0))
+    losses = loss or prior.noised_loss
+    size = chunk or len(x0)
+    for start in range(own.start, own.stop, size):
+        rows = slice(start, min(start + size, own.stop))
+        with torch.no_grad():
+            text = None if prompts is None else prior.encode_prompts(prompts[rows])
+        mean = losses(noised.rows(rows), text).mean() * ((rows.stop - start) / len(x0))
+        value += float(mean.detach())
+        (coefficient * mean).backward()
+        total.add_part()
+    total.write()
+    processes.sum_gradients(parameters)
+    norm = gradient_norm(parameters)
+    for parameter, gradient in zip(parameters, before, strict=True):
+        if gradient is not None:
+            parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+    return processes.sum_numbers(value)[0], norm
+
+
+@dataclass(frozen=True)
+class DiscriminativeLoss:
+    """Direct discriminative optimisation (Zheng et al. 2025, arXiv 2503.01103) of a diffusion prior.
+
+    The log-likelihood ratio of the prior and its base is the logit of a discriminator of real scenes and samples of the
+    base prior, which is trained with the logistic loss. The odds of the best discriminator are the density of real
+    scenes divided by that of base samples, so the best prior has the density of real scenes. The pretraining loss l of
+    a noised scene takes the place of -log p. With the gap d = l(base) - l(prior), the losses are
+
+        (2 / s) softplus(-s d) of real scenes,    (2 / s) softplus(s d) of base samples
+
+    At the base prior, their gradients are those of l and of -l. The gradient of a real scene vanishes where s d is
+    large, and that of a base sample where -s d is large. So no sample repels without bound. Where base samples are like
+    real scenes, the two gradients cancel in the mean.
+
+    Attributes:
+        prior: prior in training.
+        base: base prior, with which the prior is compared; its weights get no gradient.
+        sharpness: factor s, per unit of the pretraining loss; near 0 the loss of base samples has no bound.
+
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="mixed")
+    >>> noised = prior.noised(prior.encode(prior.sample(2, num_steps=3)))
+    >>> loss = DiscriminativeLoss(prior, prior, sharpness=20.0)
+    >>> [round(value, 4) for value in loss.of_base(noised).tolist()]  # (2 / s) log 2
+    [0.0693, 0.0693]
+    """
+
+    prior: ScenePrior
+    base: ScenePrior
+    sharpness: float
+
+    def of_real(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+        """(B,) losses of noised real scenes."""
+        return F.softplus(-self.sharpness * self.gap(noised, text)) * (2 / self.sharpness)
+
+    def of_base(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+        """(B,) losses of noised samples of the base prior."""
+        return F.softplus(self.sharpness * self.gap(noised, text)) * (2 / self.sharpness)
+
+    def gap(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+        """(B,) pretraining losses of the base prior minus those of the prior in training."""
+        with torch.no_grad():
+            base = self.base.noised_loss(noised, text)
+        return base - self.prior.noised_loss(noised, text)
+
+
+def relative_error(target: float, measured: float) -> float:
+    """Measured ratio minus target, divided by target minus 1: 0 at the target, -1 at the base prior's ratio."""
+    error = (measured - 1.0) / (target - 1.0) - 1.0
+    return max(-1.0, min(error, MAX_ERROR)) if error == error else MAX_ERROR
+
+
+@dataclass(frozen=True)
+class HoldState:
+    """State of the controller; plain numbers, for checkpoints.
+
+    Attributes:
+        log_factor: logarithm of the factor on the weight of the regularisation.
+        iteration: iteration of the last measurement.
+        measured: last measured ratio; None before the first measurement.
+        slope: change of the ratio per iteration, averaged.
+        beyond: number of measurements in a row above the target with the factor at its upper bound.
+        lost_at: iteration from which the target counts as not held; None while it counts as held.
+    """
+
+    log_factor: float = 0.0
+    iteration: int = 0
+    measured: float | None = None
+    slope: float = 0.0
+    beyond: int = 0
+    lost_at: int | None = None
+
+    @property
+    def factor(self) -> float:
+        """Factor on the weight."""
+        return math.exp(self.log_factor)
+
+    def returned(self, measured: float) -> HoldState:
+        """The state after a return to an earlier checkpoint of ratio ``measured``, which is no change by training."""
+        return replace(self, measured=measured, slope=0.0)
+
+
+def adjust(state: HoldState, target: float, measured: float, iteration: int) -> HoldState:
+    """The state after a measurement: integral control of the factor's logarithm, within bounds.
+
+    It is the controller of Ziegler et al. (2019, Eq. 4) with two changes. The gain is per iteration, so that checks
+    may come at any distance. The figure is extrapolated by ``LOOK_AHEAD`` iterations with its averaged change per
+    iteration. The error is bounded; an error that is not a number counts as the largest.
+
+    Args:
+        state: state before the measurement.
+        target: ratio that is held.
+        measured: ratio of the held-out loss to the base prior's now.
+        iteration: number of the finished iteration.
+
+    >>> state = adjust(HoldState(), 1.05, measured=1.1, iteration=1)
+    >>> round(state.factor, 3)
+    1.162
+    """
+    span = max(1, iteration - state.iteration)
+    first = measured if state.iteration else 1.0
+    before = first if state.measured is None else state.measured
+    slope = state.slope + (1.0 - math.exp(-span / SMOOTHING)) * ((measured - before) / span - state.slope)
+    slope = slope if math.isfinite(slope) else 0.0
+    error = relative_error(target, measured + LOOK_AHEAD * slope)
+    step = GAIN * span * error
+    log_factor = max(math.log(MIN_FACTOR), min(state.log_factor + step, math.log(MAX_FACTOR)))
+    beyond = state.beyond + 1 if relative_error(target, measured) > 0 and log_factor >= math.log(MAX_FACTOR) else 0
+    lost_at = iteration if state.lost_at is None and beyond >= PATIENCE else state.lost_at
+    return HoldState(log_factor, iteration, measured, slope, beyond, lost_at)

@@ -1,4 +1,4 @@
-"""Report of a run: one self-contained HTML file."""
+"""Report of a run: fresh samples of both priors, measured, drawn and written as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
-from agents.post_training.learner import LearnedRewards
-from agents.post_training.rollouts import PromptDeck, prompts_beside, stream_seed
+from agents.post_training.guard import realism
+from agents.post_training.rollouts import PromptDeck, run_prompts, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
     FAINT,
@@ -30,8 +30,8 @@ from agents.post_training.trainer import PostTrainResult, post_train
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import load_checkpoint
 from agents.utils.process_group import ProcessGroup
-from rewards import PromptMatch, RewardContext, RewardOutput, evaluate_reward, reward_label
-from rewards.process import close_reward, run_reward
+from rewards import PromptMatch, RewardContext, RewardOutput, evaluate_reward, learned_parts, reward_label
+from rewards.process import close_reward
 from scene_envs.files import page_part, page_template
 from scene_envs.scene import SceneBatch
 
@@ -39,88 +39,12 @@ if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
 
 
-@dataclass(frozen=True)
-class Picture:
-    """An image of the page.
-
-    Attributes:
-        path: PNG file that is embedded in the page.
-        caption: one line below the image.
-    """
-
-    path: Path
-    caption: str
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A headline number.
-
-    Attributes:
-        label: name of the number.
-        value: the number as text.
-        note: the value that the number is compared with.
-    """
-
-    label: str
-    value: str
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class Section:
-    """A heading with text, pictures (in two columns) and a table.
-
-    Attributes:
-        title: heading.
-        text: one paragraph.
-        pictures: images.
-        table: rows of cells; the first row is the head.
-    """
-
-    title: str
-    text: str = ""
-    pictures: Sequence[Picture] = ()
-    table: Sequence[Sequence[str]] = ()
-
-
-@dataclass(frozen=True)
-class Page:
-    """Content of a report.
-
-    Attributes:
-        title: heading of the page.
-        lead: a sentence or two on the run.
-        tiles: headline numbers.
-        sections: sections of the page, in order.
-        settings: settings of the run, shown folded at the end.
-    """
-
-    title: str
-    lead: str
-    tiles: Sequence[Tile] = ()
-    sections: Sequence[Section] = ()
-    settings: Mapping[str, Any] = field(default_factory=dict)
-
-
-def write_report(path: Path, page: Page) -> Path:
-    """Write ``page`` as one self-contained HTML file: styles and pictures inside, no script, no link."""
-    write_text(path, render_page(page))
-    return path
-
-
-def render_page(page: Page) -> str:
-    """The HTML of ``page``; all text is escaped.
-
-    >>> "<h1>a &lt; b</h1>" in render_page(Page("a < b", ""))
-    True
-    """
-    from markupsafe import Markup
-
-    style = Markup(page_part("agents.utils", "report.css"))
-    return page_template("agents.post_training", "report.html").render(page=page, style=style)
-
-
+SAMPLE_SEED = 100_000
+"""Number added to the run's seed for the measured samples, so that their noise differs from that of training."""
+PHYSICS_TIMEOUT = 300.0
+"""Seconds for a chunk of scenes; long, so that a slow scene on a busy machine does not become invalid."""
+_GALLERY, _COLUMNS, _TILE = 12, 3, (400, 300)
+"""Number of scenes of a gallery, number of its columns, and width and height of a scene in pixels."""
 _GUARD_LABELS = {
     "loss": "held-out loss",
     "sample_reward": "mean reward",
@@ -130,6 +54,375 @@ _GUARD_LABELS = {
     "classifier_accuracy": "accuracy of a classifier, samples against real scenes",
 }
 """Labels of the figures of a check on the page."""
+_LABELS = {
+    "reward": "the trained reward",
+    "objects": "objects per scene (welded included)",
+    "feasible_objects": "feasible free objects, as sampled",
+    "feasible_fraction": "their share of free objects",
+    "ready_objects": "simulation-ready free objects",
+    "ready_fraction": "their share of free objects ",
+    "workspace_fraction": "objects in the workspace, as sampled",
+    "height_error_table_mm": "height error on the table, median mm",
+    "height_error_stack_mm": "height error in stacks, median mm",
+    "prompt_match": "match of prompt and scene, 1 at best",
+    "reward_invalid": "scenes that the reward could not score",
+    "invalid_scenes": "scenes whose simulation was ended",
+}
+"""Labels of the measured figures on the page."""
+
+
+def post_train_and_compare(
+    config: PostTrainConfig, *, scenes: int = 256, num_steps: int = 50, prior: ScenePrior | None = None
+) -> dict[str, Any]:
+    """Post-train, measure the base and the post-trained prior on fresh samples, and write the report.
+
+    Both priors start from the same noise, and every sample is measured. Physics decides which objects are
+    simulation-ready.
+
+    Args:
+        config: configuration of the run; ``config.output`` gets ``report.html``, ``curve.png``, ``before.png``,
+            ``after.png``, ``metrics.json`` and the prior. An interrupted run found there is resumed.
+        scenes: number of fresh samples of each prior.
+        num_steps: denoiser evaluations per measured sample.
+        prior: prior to start from, in place of the one that ``config.prior`` names.
+
+    Returns:
+        The numbers of ``metrics.json``: ``before`` and ``after`` (``reward``, ``objects``, ``feasible_objects`` raw,
+        ``ready_objects``, and ``prompt_match`` with prompts), ``change``, ``guard``, ``stage_seconds``, and the run's
+        own metrics. With several processes, only the first one measures; the others return the run's own metrics.
+    """
+    from scene_envs.physics import make_pool
+
+    def say(text: str) -> None:
+        """Print on stderr what is done next, unless the run shows no progress."""
+        if config.progress != "none":
+            print(text, file=sys.stderr, flush=True)
+
+    started = time.perf_counter()
+    base = ScenePrior.load(config.prior if prior is None else prior)
+    result = post_train(config, prior=base)
+    if not ProcessGroup.current().is_first:
+        return result.metrics
+    trained = time.perf_counter()
+    seed = config.seed + SAMPLE_SEED
+    directory, slots = config.directory, base.config.slots if config.slots is None else config.slots
+    prompts = None
+    if config.prompt is not None:
+        prompts = _measured_prompts(directory, base, config.prompt, scenes, slots, config.seed)
+    reward = config.resolved_reward()
+    with make_pool(config.workers, PHYSICS_TIMEOUT) as pool, ExitStack() as stack:
+        stack.callback(close_reward, reward)
+        load_learned_rewards(reward, directory, config.guard.scenes, config.seed)
+
+        def measure(prior: ScenePrior) -> Measured:
+            return measure_prior(
+                prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=prompts, guidance=config.guidance,
+                claim_guidance=config.claim_guidance, slots=slots, reward=reward,
+            )  # fmt: skip
+
+        say(f"measuring {scenes} samples of the base prior")
+        before = measure(base)
+        say(f"measuring {scenes} samples of the post-trained prior")
+        after = measure(result.prior)
+    seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
+    say("drawing the report")
+    title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_label(config.reward)}"
+    extra = {"stage_seconds": seconds, "num_steps": num_steps}
+    return _write_comparison(result, before, after, title, extra)
+
+
+def load_learned_rewards(reward: Any, directory: Path, heldout: int, seed: int) -> None:
+    """Give the parts of ``reward`` that learn their state at the end of a run.
+
+    Args:
+        reward: resolved reward.
+        directory: folder of the run.
+        heldout: number of real scenes that the guard held out.
+        seed: seed of the run.
+    """
+    if parts := learned_parts(reward):
+        real = SceneBatch.load(directory / SCENES_NAME)
+        state = load_checkpoint(directory / CHECKPOINT_NAME)["learner"]["learned_rewards"]
+        for part, own in zip(parts, state, strict=True):
+            part.begin(real[: len(real) - heldout], stream_seed(seed, "discriminator"))
+            part.load_state_dict(own)
+
+
+def _measured_prompts(directory: Path, prior: ScenePrior, prompt: Any, count: int, slots: int, seed: int) -> list[str]:
+    """One prompt per measured sample, from the source of the run's prompts."""
+    batch = SceneBatch.load(directory / SCENES_NAME)
+    real = run_prompts(directory, batch, stream_seed(seed, "bank"))
+    deck = PromptDeck.of(prior, prompt, 1, slots, real, len(batch))
+    return deck.deal(count, Generator().manual_seed(seed + SAMPLE_SEED))
+
+
+def _write_comparison(
+    result: PostTrainResult, before: Measured, after: Measured, title: str, extra: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Write pictures, page and metrics to the run folder; returns the metrics, with the relative ``change``."""
+    directory, settings = result.directory, result.config.plain()
+    names = [name for name in ("reward", "objects", "feasible_objects", "ready_objects") if name in before.figures]
+    change = {name: _relative(before.figures[name], after.figures.get(name)) for name in names}
+    metrics = {"before": before.figures, "after": after.figures, "change": change, **result.metrics, **extra}
+    pictures = {
+        "before": draw_gallery(before.raw, directory / "before.png"),
+        "after": draw_gallery(after.raw, directory / "after.png"),
+        "before_ready": draw_gallery(before.ready, directory / "before_ready.png", before.is_ready),
+        "after_ready": draw_gallery(after.ready, directory / "after_ready.png", after.is_ready),
+    }
+    for name in ("guard_within", "guard_beyond"):
+        if (path := directory / f"{name}.safetensors").exists():
+            pictures[name] = draw_gallery(SceneBatch.load(path), directory / f"{name}.png")
+    held = hold_sections(metrics.get("hold"), result.history, directory / "hold.png")
+    write_report(directory / "report.html", _page(title, metrics, directory / "curve.png", pictures, settings, held))
+    write_metrics(directory, metrics)
+    return metrics
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Fresh samples of a prior and their measured figures.
+
+    Attributes:
+        figures: ``objects`` (mean count, welded included), ``objects_sem`` (its standard error), ``feasible_objects``
+            (free, raw), ``feasible_fraction`` of free objects, ``ready_objects`` (free, after projection and
+            settling, feasible and in the workspace), ``ready_objects_sem``, ``ready_fraction``, ``scenes``,
+            ``reward`` (mean of the trained reward), ``reward_sem``, ``reward_invalid`` (scenes it could not score),
+            ``prompt_match`` (with prompts: the reward of that name), ``prompt_match_sem``,
+            ``invalid_scenes`` (physics failed: left out of feasible and ready figures), and the cheap realism figures.
+        raw: raw samples.
+        ready: the samples after projection and settling.
+        is_ready: (B, N) bool, simulation-ready objects of ``ready``.
+    """
+
+    figures: dict[str, float]
+    raw: SceneBatch
+    ready: SceneBatch
+    is_ready: Tensor
+
+
+def measure_prior(
+    prior: ScenePrior,
+    count: int,
+    *,
+    num_steps: int = 50,
+    seed: int = 0,
+    pool: PhysicsPool | None = None,
+    prompts: Sequence[str] | None = None,
+    guidance: float = 0.0,
+    claim_guidance: float = 0.0,
+    slots: int | None = None,
+    reward: Any = None,
+) -> Measured:
+    """Sample ``count`` scenes and measure all of them.
+
+    Args:
+        prior: prior to measure.
+        count: number of scenes.
+        num_steps: denoiser evaluations per scene.
+        seed: seed of the samples; the same seed for two priors starts both from the same noise.
+        pool: physics workers.
+        prompts: one prompt per scene, with which the samples are compared; None for none.
+        guidance: weight of classifier-free guidance.
+        claim_guidance: strength of claim guidance.
+        slots: slots per sample; None takes as many as the prior was trained on.
+        reward: reward that the run trains with, as :func:`rewards.process.run_reward` gives it; None measures none.
+    """
+    from scene_envs.physics import feasibility, make_ready
+
+    raw = prior.sample(
+        count, prompt=prompts, guidance=guidance, claim_guidance=claim_guidance, physics_guidance=0.0,
+        num_steps=num_steps, slots=slots, seed=seed,
+    )  # fmt: skip
+    feasible = feasibility(raw, pool=pool)
+    ready = make_ready(raw, pool=pool)
+    context = RewardContext(None if prompts is None else tuple(prompts), pool)
+    scored = None if reward is None else evaluate_reward(reward, raw, context)
+    counts = raw.counts.double()
+    free = raw.is_free.sum(dim=-1).double()
+    figures = {
+        "scenes": float(count),
+        "objects": float(counts.mean()),
+        "objects_sem": _standard_error(counts),
+        **({} if scored is None else _mean("reward", scored)),
+        **({} if scored is None else {"reward_invalid": float((~scored.is_valid).sum())}),
+        **_counted("feasible", feasible.counts, feasible.valid, free),
+        **_counted("ready", ready.counts, ready.valid, free),
+        "invalid_scenes": float((~(feasible.valid & ready.valid)).sum()),
+        **realism(raw),
+        **({} if prompts is None else _mean("prompt_match", PromptMatch()(raw, RewardContext(prompts=tuple(prompts))))),
+    }
+    return Measured(figures, raw, ready.batch, ready.ready)
+
+
+def _counted(name: str, counts: Tensor, valid: Tensor, free: Tensor) -> dict[str, float]:
+    """Mean and standard error of ``counts`` over valid scenes, and their share of the free objects there."""
+    if not bool(valid.any()):
+        return {}
+    taken = counts[valid].double()
+    share = float(taken.sum() / free[valid].sum()) if float(free[valid].sum()) else 0.0
+    return {
+        f"{name}_objects": float(taken.mean()),
+        f"{name}_objects_sem": _standard_error(taken),
+        f"{name}_fraction": share,
+    }
+
+
+def _mean(name: str, output: RewardOutput) -> dict[str, float]:
+    """Mean and standard error of a reward over its valid scenes; empty without any."""
+    value = output.value[output.is_valid].double()
+    return {name: float(value.mean()), f"{name}_sem": _standard_error(value)} if len(value) else {}
+
+
+def _standard_error(values: Tensor) -> float:
+    return float(values.std(unbiased=True) / len(values) ** 0.5) if len(values) > 1 else 0.0
+
+
+def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) -> Path:
+    """Draw the first scenes of ``batch`` with their counts as a PNG.
+
+    Args:
+        batch: scenes to draw.
+        path: image file to write.
+        is_ready: (B, N) bool; if given, captions count these objects, and the other free objects are red.
+    """
+    images, captions = _drawn(batch, is_ready, _GALLERY)
+    return _save_gallery(images, captions, path)
+
+
+def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bool = False) -> Path:
+    """Draw the first scenes of several priors as a PNG: a row per scene, a column per prior.
+
+    Args:
+        measured: samples of each prior from the same noise, by the name in the captions; three fit the page.
+        path: image file to write.
+        ready: whether to show the scenes after projection and settling, with objects that are not ready in red.
+    """
+    drawn = [
+        _drawn(part.ready if ready else part.raw, part.is_ready if ready else None, _GALLERY // 2)
+        for part in measured.values()
+    ]
+    images = [image for row in zip(*(images for images, _ in drawn), strict=True) for image in row]
+    texts = zip(*(captions for _, captions in drawn), strict=True)
+    captions = [f"{name}: {text}" for row in texts for name, text in zip(measured, row, strict=True)]
+    return _save_gallery(images, captions, path)
+
+
+def _drawn(batch: SceneBatch, is_ready: Tensor | None, count: int) -> tuple[NDArray[np.uint8], list[str]]:
+    """Images (b, H, W, 3) of the first ``count`` scenes, and a caption for each."""
+    from scene_envs.render import render
+
+    shown = batch[:count]
+    width, height = _TILE
+    if is_ready is None:
+        return render(shown, width=width, height=height), [f"{count} objects" for count in shown.counts.tolist()]
+    ready = is_ready[: len(shown)].cpu()
+    images = render(shown, width=width, height=height, highlight=shown.is_free.cpu() & ~ready)
+    free = shown.is_free.sum(dim=-1).tolist()
+    return images, [f"{good} of {total} ready" for good, total in zip(ready.sum(dim=-1).tolist(), free, strict=True)]
+
+
+def _save_gallery(images: Sequence[NDArray[np.uint8]] | NDArray[np.uint8], captions: list[str], path: Path) -> Path:
+    from scene_envs.render import gallery
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    gallery(images, columns=_COLUMNS, captions=captions).quantize(192).save(path, optimize=True)
+    return path
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG file that the page embeds, and one line below it."""
+
+    path: Path
+    caption: str
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A headline number as text: its name, its value, and the value that it is compared with."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with one paragraph, pictures (in two columns) and a table, whose first row is the head."""
+
+    title: str
+    text: str = ""
+    pictures: Sequence[Picture] = ()
+    table: Sequence[Sequence[str]] = ()
+
+
+@dataclass(frozen=True)
+class Page:
+    """Content of a report: heading, a sentence or two on the run, tiles, sections, and the settings, folded."""
+
+    title: str
+    lead: str
+    tiles: Sequence[Tile] = ()
+    sections: Sequence[Section] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+def write_report(path: Path, page: Page) -> Path:
+    """Write ``page`` as one HTML file with styles and pictures inside, without script or link; text is escaped."""
+    from markupsafe import Markup
+
+    style = Markup(page_part("agents.utils", "report.css"))
+    write_text(path, page_template("agents.post_training", "report.html").render(page=page, style=style))
+    return path
+
+
+def _page(
+    title: str,
+    metrics: Mapping[str, Any],
+    curve: Path,
+    pictures: Mapping[str, Path],
+    settings: Mapping[str, Any],
+    held: Sequence[Section],
+) -> Page:
+    reward = reward_label(settings["reward"])
+    algorithm = settings["algorithm"]["name"].upper().replace("_", "-")
+    before, after, guard = metrics["before"], metrics["after"], metrics["guard"]
+    count = int(before["scenes"])
+    lead = (
+        f"{metrics['iterations']} iterations of {algorithm} on {reward}, with the pretraining loss on real scenes as "
+        f"regularisation. All numbers are means over {count} fresh, seeded samples of each prior; none was selected."
+    )
+    tiles = [
+        _tile(f"reward: {reward}", "reward", before, after, "no scene could be scored"),
+        _tile("objects per scene", "objects", before, after),
+        _tile("feasible as sampled", "feasible_objects", before, after),
+        _tile("simulation-ready", "ready_objects", before, after),
+        Tile("held-out loss", f"{guard['ratio']:.2f}×", f"of the base prior; limit {guard['limit']:g}×"),
+    ]
+    over = guard["over_optimised_from"]
+    verdict = f"{guard_verdict(guard)} The prior kept is that of iteration {guard['best_iteration']}."
+    if lost := metrics["reward"].get("invalid_scenes"):
+        verdict += f" The reward could not score {lost} of the scenes; log.txt says why."
+    caption = f"Mean {reward} of each batch, and the guard." + ("" if over is None else " Shaded: over-optimised.")
+    sections = [
+        Section("The curve", verdict, [Picture(curve, caption)]),
+        *held,
+        *guard_sections(guard, pictures),
+        Section(
+            "As sampled",
+            "The first samples of each prior from the same noise, untouched.",
+            [Picture(pictures["before"], "Before"), Picture(pictures["after"], "After")],
+        ),
+        Section(
+            "Simulation-ready",
+            "The same samples, projected out of penetration and settled. Red objects are not ready: they still move, "
+            "penetrate, or have left the workspace.",
+            [Picture(pictures["before_ready"], "Before"), Picture(pictures["after_ready"], "After")],
+        ),
+        Section("Numbers", table=_with_change(before, after)),
+    ]
+    return Page(title, lead, tiles, sections, settings)
 
 
 def guard_verdict(guard: Mapping[str, Any]) -> str:
@@ -194,233 +487,6 @@ def _draw(target: float, history: Sequence[Mapping[str, float]], path: Path) -> 
     return path
 
 
-_GALLERY, _COLUMNS, _TILE = 12, 3, (400, 300)
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Fresh samples of a prior and their measured figures.
-
-    Attributes:
-        figures: ``objects`` (mean count, welded included), ``objects_sem`` (its standard error), ``feasible_objects``
-            (free, raw), ``feasible_fraction`` of free objects, ``ready_objects`` (free, after projection and
-            settling, feasible and in the workspace), ``ready_objects_sem``, ``ready_fraction``, ``scenes``,
-            ``reward`` (mean of the trained reward), ``reward_sem``, ``reward_invalid`` (scenes it could not score),
-            ``prompt_match`` (with prompts: the reward of that name), ``prompt_match_sem``,
-            ``invalid_scenes`` (physics failed: left out of feasible and ready figures), and the cheap realism figures.
-        raw: raw samples.
-        ready: the samples after projection and settling.
-        is_ready: (B, N) bool, simulation-ready objects of ``ready``.
-    """
-
-    figures: dict[str, float]
-    raw: SceneBatch
-    ready: SceneBatch
-    is_ready: Tensor
-
-
-def measure_prior(
-    prior: ScenePrior,
-    count: int,
-    *,
-    num_steps: int = 50,
-    seed: int = 0,
-    pool: PhysicsPool | None = None,
-    prompts: Sequence[str] | None = None,
-    guidance: float = 0.0,
-    claim_guidance: float = 0.0,
-    slots: int | None = None,
-    reward: Any = None,
-) -> Measured:
-    """Sample ``count`` scenes and measure all of them.
-
-    Args:
-        prior: prior to measure.
-        count: number of scenes.
-        num_steps: denoiser evaluations per scene.
-        seed: seed of the samples; the same seed for two priors starts both from the same noise.
-        pool: physics workers.
-        prompts: one prompt per scene, with which the samples are compared; None for none.
-        guidance: weight of classifier-free guidance.
-        claim_guidance: strength of claim guidance.
-        slots: per sample; None means as trained.
-        reward: reward that the run trains with, as :func:`rewards.process.run_reward` gives it; None measures none.
-    """
-    from agents.post_training.guard import realism
-    from scene_envs.physics import feasibility, make_ready
-
-    raw = prior.sample(
-        count, prompt=prompts, guidance=guidance, claim_guidance=claim_guidance, physics_guidance=0.0,
-        num_steps=num_steps, slots=slots, seed=seed,
-    )  # fmt: skip
-    feasible = feasibility(raw, pool=pool)
-    ready = make_ready(raw, pool=pool)
-    counts = raw.counts.double()
-    free = raw.is_free.sum(dim=-1).double()
-    figures = {
-        "scenes": float(count),
-        "objects": float(counts.mean()),
-        "objects_sem": _standard_error(counts),
-        **({} if reward is None else _reward_figures(raw, reward, prompts, pool)),
-        **_counted("feasible", feasible.counts, feasible.valid, free),
-        **_counted("ready", ready.counts, ready.valid, free),
-        "invalid_scenes": float((~(feasible.valid & ready.valid)).sum()),
-        **realism(raw),
-        **({} if prompts is None else _mean("prompt_match", PromptMatch()(raw, RewardContext(prompts=tuple(prompts))))),
-    }
-    return Measured(figures, raw, ready.batch, ready.ready)
-
-
-def write_comparison(
-    result: PostTrainResult, before: Measured, after: Measured, *, title: str, extra: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Write ``before.png``, ``after.png``, ``report.html`` and ``metrics.json`` to the run folder.
-
-    Args:
-        result: result of the run.
-        before: samples of the base prior.
-        after: samples of the post-trained prior.
-        title: heading of the page.
-        extra: more entries for ``metrics.json``.
-
-    Returns:
-        Content of ``metrics.json``: the run's metrics, ``before``, ``after`` and ``change`` (relative).
-    """
-    directory, settings = result.directory, result.config.plain()
-    names = [name for name in ("reward", "objects", "feasible_objects", "ready_objects") if name in before.figures]
-    change = {name: _relative(before.figures[name], after.figures.get(name)) for name in names}
-    metrics = {"before": before.figures, "after": after.figures, "change": change, **result.metrics, **(extra or {})}
-    pictures = {
-        "before": draw_gallery(before.raw, directory / "before.png"),
-        "after": draw_gallery(after.raw, directory / "after.png"),
-        "before_ready": draw_gallery(before.ready, directory / "before_ready.png", before.is_ready),
-        "after_ready": draw_gallery(after.ready, directory / "after_ready.png", after.is_ready),
-    }
-    for name in ("guard_within", "guard_beyond"):
-        if (path := directory / f"{name}.safetensors").exists():
-            pictures[name] = draw_gallery(SceneBatch.load(path), directory / f"{name}.png")
-    held = hold_sections(metrics.get("hold"), result.history, directory / "hold.png")
-    write_report(directory / "report.html", _page(title, metrics, directory / "curve.png", pictures, settings, held))
-    write_metrics(directory, metrics)
-    return metrics
-
-
-def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) -> Path:
-    """Draw the first scenes of ``batch`` with their counts as a PNG.
-
-    Args:
-        batch: scenes to draw.
-        path: image file to write.
-        is_ready: (B, N) bool; if given, captions count these objects, and the other free objects are red.
-    """
-    images, captions = _drawn(batch, is_ready, _GALLERY)
-    return _save_gallery(images, captions, path)
-
-
-def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bool = False) -> Path:
-    """Draw the first scenes of several priors as a PNG: a row per scene, a column per prior.
-
-    Args:
-        measured: samples of each prior from the same noise, by the name in the captions; three fit the page.
-        path: image file to write.
-        ready: whether to show the scenes after projection and settling, with objects that are not ready in red.
-    """
-    drawn = [
-        _drawn(part.ready if ready else part.raw, part.is_ready if ready else None, _GALLERY // 2)
-        for part in measured.values()
-    ]
-    images = [image for row in zip(*(images for images, _ in drawn), strict=True) for image in row]
-    texts = zip(*(captions for _, captions in drawn), strict=True)
-    captions = [f"{name}: {text}" for row in texts for name, text in zip(measured, row, strict=True)]
-    return _save_gallery(images, captions, path)
-
-
-def _drawn(batch: SceneBatch, is_ready: Tensor | None, count: int) -> tuple[NDArray[np.uint8], list[str]]:
-    """Images (b, H, W, 3) of the first ``count`` scenes, and a caption for each."""
-    from scene_envs.render import render
-
-    shown = batch[:count]
-    width, height = _TILE
-    if is_ready is None:
-        return render(shown, width=width, height=height), [f"{count} objects" for count in shown.counts.tolist()]
-    ready = is_ready[: len(shown)].cpu()
-    images = render(shown, width=width, height=height, highlight=shown.is_free.cpu() & ~ready)
-    free = shown.is_free.sum(dim=-1).tolist()
-    return images, [f"{good} of {total} ready" for good, total in zip(ready.sum(dim=-1).tolist(), free, strict=True)]
-
-
-def _save_gallery(images: Sequence[NDArray[np.uint8]] | NDArray[np.uint8], captions: list[str], path: Path) -> Path:
-    from scene_envs.render import gallery
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    gallery(images, columns=_COLUMNS, captions=captions).quantize(192).save(path, optimize=True)
-    return path
-
-
-def _page(
-    title: str,
-    metrics: Mapping[str, Any],
-    curve: Path,
-    pictures: Mapping[str, Path],
-    settings: Mapping[str, Any],
-    held: Sequence[Section],
-) -> Page:
-    reward = reward_label(settings["reward"])
-    algorithm = settings["algorithm"]["name"].upper().replace("_", "-")
-    before, after, guard = metrics["before"], metrics["after"], metrics["guard"]
-    count = int(before["scenes"])
-    lead = (
-        f"{metrics['iterations']} iterations of {algorithm} on {reward}, with the pretraining loss on real scenes as "
-        f"regularisation. All numbers are means over {count} fresh, seeded samples of each prior; none was selected."
-    )
-    tiles = [
-        _tile(f"reward: {reward}", "reward", before, after, "no scene could be scored"),
-        _tile("objects per scene", "objects", before, after),
-        _tile("feasible as sampled", "feasible_objects", before, after),
-        _tile("simulation-ready", "ready_objects", before, after),
-        Tile("held-out loss", f"{guard['ratio']:.2f}×", f"of the base prior; limit {guard['limit']:g}×"),
-    ]
-    over = guard["over_optimised_from"]
-    verdict = f"{guard_verdict(guard)} The prior kept is that of iteration {guard['best_iteration']}."
-    if lost := metrics["reward"].get("invalid_scenes"):
-        verdict += f" The reward could not score {lost} of the scenes; log.txt says why."
-    caption = f"Mean {reward} of each batch, and the guard." + ("" if over is None else " Shaded: over-optimised.")
-    sections = [
-        Section("The curve", verdict, [Picture(curve, caption)]),
-        *held,
-        *guard_sections(guard, pictures),
-        Section(
-            "As sampled",
-            "The first samples of each prior from the same noise, untouched.",
-            [Picture(pictures["before"], "Before"), Picture(pictures["after"], "After")],
-        ),
-        Section(
-            "Simulation-ready",
-            "The same samples, projected out of penetration and settled. Red objects are not ready: they still move, "
-            "penetrate, or have left the workspace.",
-            [Picture(pictures["before_ready"], "Before"), Picture(pictures["after_ready"], "After")],
-        ),
-        Section("Numbers", table=_with_change(before, after)),
-    ]
-    return Page(title, lead, tiles, sections, settings)
-
-
-_LABELS = {
-    "reward": "the trained reward",
-    "objects": "objects per scene (welded included)",
-    "feasible_objects": "feasible free objects, as sampled",
-    "feasible_fraction": "their share of free objects",
-    "ready_objects": "simulation-ready free objects",
-    "ready_fraction": "their share of free objects ",
-    "workspace_fraction": "objects in the workspace, as sampled",
-    "height_error_table_mm": "height error on the table, median mm",
-    "height_error_stack_mm": "height error in stacks, median mm",
-    "prompt_match": "match of prompt and scene, 1 at best",
-    "reward_invalid": "scenes that the reward could not score",
-    "invalid_scenes": "scenes whose simulation was ended",
-}
-
-
 def number_rows(columns: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:
     """Rows of a table with a column of figures per prior; figures that one of them lacks are left out."""
     names = [name for name in _LABELS if all(name in figures for figures in columns.values())]
@@ -457,123 +523,3 @@ def _tile(
 def _relative(before: float, after: float | None) -> float | None:
     """The relative change; None if ``before`` is not positive."""
     return None if after is None or before <= 0 else after / before - 1.0
-
-
-def _counted(name: str, counts: Tensor, valid: Tensor, free: Tensor) -> dict[str, float]:
-    """Mean and standard error of ``counts`` over valid scenes, and their share of the free objects there."""
-    if not bool(valid.any()):
-        return {}
-    taken = counts[valid].double()
-    share = float(taken.sum() / free[valid].sum()) if float(free[valid].sum()) else 0.0
-    return {
-        f"{name}_objects": float(taken.mean()),
-        f"{name}_objects_sem": _standard_error(taken),
-        f"{name}_fraction": share,
-    }
-
-
-def _reward_figures(
-    batch: SceneBatch, reward: Any, prompts: Sequence[str] | None, pool: PhysicsPool | None
-) -> dict[str, float]:
-    """Mean of ``reward`` over the scenes that it can score, and the number of the others."""
-    output = evaluate_reward(reward, batch, RewardContext(None if prompts is None else tuple(prompts), pool))
-    return {**_mean("reward", output), "reward_invalid": float((~output.is_valid).sum())}
-
-
-def _mean(name: str, output: RewardOutput) -> dict[str, float]:
-    """Mean and standard error of a reward over its valid scenes; empty without any."""
-    value = output.value[output.is_valid].double()
-    return {name: float(value.mean()), f"{name}_sem": _standard_error(value)} if len(value) else {}
-
-
-def _standard_error(values: Tensor) -> float:
-    return float(values.std(unbiased=True) / len(values) ** 0.5) if len(values) > 1 else 0.0
-
-
-SAMPLE_SEED = 100_000
-"""Number added to the run's seed for the measured samples, so that their noise differs from that of training."""
-
-PHYSICS_TIMEOUT = 300.0
-"""Seconds for a chunk of scenes; long, so that a slow scene on a busy machine does not become invalid."""
-
-
-def post_train_and_compare(
-    config: PostTrainConfig, *, scenes: int = 256, num_steps: int = 50, prior: ScenePrior | None = None
-) -> dict[str, Any]:
-    """Post-train, measure the base and the post-trained prior on fresh samples, and write the report.
-
-    Both priors start from the same noise, and every sample is measured. Physics decides which objects are
-    simulation-ready.
-
-    Args:
-        config: the run; ``config.output`` gets ``report.html``, ``curve.png``, ``before.png``, ``after.png``,
-            ``metrics.json`` and the prior. An interrupted run found there is resumed.
-        scenes: number of fresh samples of each prior.
-        num_steps: denoiser evaluations per measured sample.
-        prior: prior to start from, in place of the one that ``config.prior`` names.
-
-    Returns:
-        The numbers of ``metrics.json``: ``before`` and ``after`` (``reward``, ``objects``, ``feasible_objects`` raw,
-        ``ready_objects``, and ``prompt_match`` with prompts), ``change``, ``guard``, ``stage_seconds``, and the run's
-        own metrics. With several processes, only the first one measures; the others return the run's own metrics.
-    """
-    from scene_envs.physics import make_pool
-
-    started = time.perf_counter()
-    base = ScenePrior.load(config.prior if prior is None else prior)
-    result = post_train(config, prior=base)
-    if not ProcessGroup.current().is_first:
-        return result.metrics
-    trained = time.perf_counter()
-    seed = config.seed + SAMPLE_SEED
-    prompts = _measured_prompts(config, base, scenes)
-    workers = 0 if config.workers == "ray" else config.workers
-    reward = run_reward(
-        config.reward, seed=config.seed, timeout=config.reward_timeout, memory=config.reward_memory, workers=workers
-    )
-    with make_pool(config.workers, PHYSICS_TIMEOUT) as pool, ExitStack() as stack:
-        stack.callback(close_reward, reward)
-        load_learned_rewards(reward, config)
-
-        def measure(prior: ScenePrior) -> Measured:
-            return measure_prior(
-                prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=prompts, guidance=config.guidance,
-                claim_guidance=config.claim_guidance, slots=config.slots, reward=reward,
-            )  # fmt: skip
-
-        say_stage(config, f"measuring {scenes} samples of the base prior")
-        before = measure(base)
-        say_stage(config, f"measuring {scenes} samples of the post-trained prior")
-        after = measure(result.prior)
-    seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
-    say_stage(config, "drawing the report")
-    title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_label(config.reward)}"
-    extra = {"stage_seconds": seconds, "num_steps": num_steps}
-    return write_comparison(result, before, after, title=title, extra=extra)
-
-
-def load_learned_rewards(reward: Any, config: PostTrainConfig) -> None:
-    """Give the parts of ``reward`` that learn their state at the end of a run."""
-    learned = LearnedRewards(reward, config)
-    if learned:
-        real = SceneBatch.load(config.directory / SCENES_NAME)
-        learned.begin(real[: len(real) - config.guard.scenes])
-        learned.restore(load_checkpoint(config.directory / CHECKPOINT_NAME)["learner"])
-
-
-def _measured_prompts(config: PostTrainConfig, prior: ScenePrior, count: int) -> list[str] | None:
-    """One prompt per measured sample, from the source of the run's prompts; None for a run without prompts."""
-    if config.prompt is None:
-        return None
-    directory = config.directory
-    batch = SceneBatch.load(directory / SCENES_NAME)
-    real = prompts_beside(directory, batch, stream_seed(config.seed, "bank"))
-    slots = prior.config.slots if config.slots is None else config.slots
-    deck = PromptDeck.of(prior, config.prompt, 1, slots, real, len(batch))
-    return deck.deal(count, Generator().manual_seed(config.seed + SAMPLE_SEED))
-
-
-def say_stage(config: PostTrainConfig, text: str) -> None:
-    """Tell on stderr what is done next, unless the run shows no progress."""
-    if config.progress != "none":
-        print(text, file=sys.stderr, flush=True)

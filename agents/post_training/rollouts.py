@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -58,11 +59,11 @@ class SeededPolicy(TensorDictModuleBase):
     Args:
         policy: policy that draws the actions.
         seed: seed of the run.
-        iteration: which batch of the run this is.
+        iteration: number of the batch in the run, from 0.
         hook: change of the distributions, as :meth:`DenoisingPolicy.claim_hook` makes it.
 
     Attributes:
-        text: what the network attends to, tokens (B, L, W) and mask (B, L); None when the prior reads no prompts.
+        text: tokens (B, L, W) and mask (B, L) that the network attends to; None when the prior reads no prompts.
     """
 
     def __init__(self, policy: DenoisingPolicy, seed: int, iteration: int = 0, hook: Hook | None = None) -> None:
@@ -122,10 +123,10 @@ def collect(
 
     Args:
         env: the torchrl adapter, in ``next_sample`` mode.
-        policy: draws x_{t-1}; must have the environment's number of steps.
+        policy: policy that draws x_{t-1}; it must have the environment's number of steps.
         seed: seed of the run; x_T and the chain's noise depend only on it and on ``iteration``.
-        iteration: which batch of the run this is.
-        prompts: one per row; None lets the environment draw them.
+        iteration: number of the batch in the run, from 0.
+        prompts: one prompt per row; None lets the environment draw them.
     """
     core, rank = env.core, ProcessGroup.current().rank
     env.set_seed(stream_seed(seed, "start", iteration) + rank * core.num_envs)
@@ -200,29 +201,10 @@ def reward_figures(batch: TensorDictBase) -> dict[str, float]:
 
 PROMPTS_NAME = "real_prompts.json"
 _PER_SCENE = 3
+"""Number of descriptions of a scene without prompts."""
 
 PromptSets = Callable[[int], Sequence[str]]
 """All prompts of a real scene, by its index."""
-
-
-class GrammarPrompts:
-    """Descriptions of scenes without prompts, written on first use.
-
-    Args:
-        batch: scenes to describe.
-        seed: seed of the descriptions; those of scene i depend only on the seed and on i.
-    """
-
-    def __init__(self, batch: SceneBatch, seed: int) -> None:
-        self.batch, self.seed = batch, seed
-        self._written: dict[int, tuple[str, ...]] = {}
-
-    def __call__(self, index: int) -> Sequence[str]:
-        """All prompts of scene ``index``."""
-        if index not in self._written:
-            rng = np.random.default_rng([self.seed, index])
-            (self._written[index],) = describe_all(self.batch[index], rng, count=_PER_SCENE)
-        return self._written[index]
 
 
 class PromptDeck:
@@ -273,18 +255,24 @@ class PromptDeck:
         return texts[int(torch.randint(len(texts), (), generator=generator))]
 
 
-def prompts_beside(directory: Path, batch: SceneBatch, seed: int) -> PromptSets:
-    """The prompts of a run's real scenes: those kept in the run's folder, or else descriptions of the scenes."""
+def run_prompts(directory: Path, batch: SceneBatch, seed: int) -> PromptSets:
+    """The prompts of a run's real scenes: those kept in the run's folder, or else descriptions of the scenes.
+
+    Descriptions are written on first use; those of scene i depend only on ``seed`` and on i.
+    """
     path = directory / PROMPTS_NAME
-    return load_prompts(path) if path.exists() else GrammarPrompts(batch, seed)
+    if path.exists():
+        kept: list[list[str]] = json.loads(path.read_text(encoding="utf-8"))
+        return kept.__getitem__
+
+    @cache
+    def described(index: int) -> Sequence[str]:
+        (texts,) = describe_all(batch[index], np.random.default_rng([seed, index]), count=_PER_SCENE)
+        return texts
+
+    return described
 
 
 def save_prompts(path: Path, prompts: Sequence[Sequence[str]]) -> None:
     """Write the prompts of a dataset's scenes to ``path``, as JSON."""
     write_text(path, json.dumps([list(texts) for texts in prompts]) + "\n")
-
-
-def load_prompts(path: Path) -> PromptSets:
-    """Inverse of :func:`save_prompts`."""
-    prompts: list[list[str]] = json.loads(path.read_text(encoding="utf-8"))
-    return prompts.__getitem__

@@ -1,10 +1,9 @@
-"""Files of a run: configuration, log and metrics, each written atomically."""
+"""Files of a run: configuration, log, metrics and curve; and its progress on the terminal."""
 
 from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from agents.configuration.composition import config_text, dotted
-from agents.post_training.settings import RESUMABLE, PostTrainConfig
+from agents.configuration.composition import dotted
+from agents.post_training.settings import RESUMABLE
 from agents.utils.checkpoints import load_checkpoint
 from scene_envs import files
 from scene_envs.errors import InvalidInputError, TrainingError
@@ -43,33 +42,6 @@ def writing(what: str, write: Callable[[], object]) -> None:
         raise TrainingError(f"could not write {what} ({error}); free some space and run the same again") from error
 
 
-def write_config(directory: Path, config: PostTrainConfig) -> None:
-    """Write ``config.yaml`` with every field of ``config``."""
-    write_text(directory / "config.yaml", files.sealed(config_text(config.plain())))
-
-
-def run_metrics(
-    history: Sequence[Mapping[str, float]],
-    batch_size: int,
-    seconds: float,
-    best_reward: float,
-    guard: Mapping[str, Any],
-) -> dict[str, Any]:
-    """Content of ``metrics.json`` for a run with the log ``history``."""
-    rewards = [row["reward"] for row in history if math.isfinite(row["reward"])]
-    return {
-        "iterations": len(history),
-        "seconds": round(seconds, 1),
-        "reward": {
-            "first": rewards[0] if rewards else None,
-            "last": rewards[-1] if rewards else None,
-            "best": best_reward,
-            "invalid_scenes": round(sum((1.0 - row["valid_fraction"]) * batch_size for row in history)),
-        },
-        "guard": dict(guard),
-    }
-
-
 def write_metrics(directory: Path, metrics: Mapping[str, Any]) -> None:
     """Write ``metrics.json``; numbers that JSON lacks become null."""
     path = directory / METRICS_NAME
@@ -86,8 +58,8 @@ def write_log(directory: Path, history: Sequence[Mapping[str, float]]) -> None:
     write_text(directory / LOG_NAME, text.getvalue())
 
 
-def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] | None:
-    """The checkpoint of an interrupted run of the same configuration, or None when there is none.
+def load_resumable(directory: Path, config: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The checkpoint of an interrupted run of the same configuration, given as plain values; None without one.
 
     Raises:
         CorruptFileError: the checkpoint is truncated.
@@ -97,7 +69,7 @@ def load_resumable(directory: Path, config: PostTrainConfig) -> dict[str, Any] |
     if not path.exists():
         return None
     state = load_checkpoint(path)
-    before, now = _flat(state.get("config", {})), _flat(config.plain())
+    before, now = _flat(state.get("config", {})), _flat(config)
     changed = [
         name for name in now if name.partition(".")[0] not in RESUMABLE and before.get(name, now[name]) != now[name]
     ]
@@ -148,9 +120,11 @@ def draw_curve(
     figure = Figure(figsize=(8.4, 5.2), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1.0))
-    upper.fill_between(iteration, *band(reward, spread, highest), color=REWARD_COLOR, alpha=0.12, linewidth=0)
+    upper.fill_between(
+        iteration, reward - spread, np.clip(reward + spread, None, highest), color=REWARD_COLOR, alpha=0.12, linewidth=0
+    )
     upper.plot(iteration, reward, color=REWARD_COLOR, alpha=0.35, linewidth=1, label="a batch ± std")
-    upper.plot(iteration, smooth(reward), color=REWARD_COLOR, linewidth=2.2, label="smoothed")
+    upper.plot(iteration, _smooth(reward), color=REWARD_COLOR, linewidth=2.2, label="smoothed")
     sampled = [(row["iteration"], row["guard_sample_reward"]) for row in history if "guard_sample_reward" in row]
     if sampled:
         upper.plot(*zip(*sampled, strict=True), "D", color=GUARD_COLOR, markersize=5, label="samples of the guard")
@@ -177,23 +151,8 @@ def draw_curve(
     return path
 
 
-def band(reward: np.ndarray, spread: np.ndarray, highest: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Reward minus and plus its standard deviation; the sum is at most ``highest``, the largest possible reward.
-
-    >>> low, high = band(np.array([0.9, 0.5]), np.array([0.2, 0.3]), highest=1.0)
-    >>> low.round(2).tolist(), high.round(2).tolist()
-    ([0.7, 0.2], [1.0, 0.8])
-    """
-    return reward - spread, np.clip(reward + spread, None, highest)
-
-
-def smooth(values: np.ndarray, window: int = 9) -> np.ndarray:
-    """Centred moving average over finite values, of the same length; the window shrinks at the ends.
-
-    >>> smooth(np.array([1.0, 2.0, 6.0]), window=3).tolist()
-    [1.5, 3.0, 4.0]
-    """
-    half = window // 2
+def _smooth(values: np.ndarray, half: int = 4) -> np.ndarray:
+    """Centred moving average over finite values, ``half`` to each side; the window shrinks at the ends."""
     parts = [values[max(0, i - half) : i + half + 1] for i in range(len(values))]
     return np.array([np.nanmean(part) if np.isfinite(part).any() else np.nan for part in parts])
 

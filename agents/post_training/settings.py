@@ -1,4 +1,4 @@
-"""Configuration of one post-training run; imports no torch."""
+"""Settings of post-training, registry of algorithms, and configuration of a run; imports no torch."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class AlgorithmSettings:
     regularisation_weight: ClassVar[float] = 0.5
     """Coefficient of the pretraining loss unless ``regularisation.weight`` names another."""
     sample_limits: ClassVar[Mapping[str, float]] = {}
-    """Limits of the guard's sample figures unless ``guard`` names others; a reward may ask for other object counts."""
+    """Limits of the guard's figures of samples unless ``guard.limits`` names others."""
 
     name: str = ""
     scenes_per_prompt: int = 8
@@ -119,6 +119,9 @@ class ForwardProcessSettings(AlgorithmSettings):
             as they are, ``auto`` is ``none`` if poses have credit per object and the reward counts no objects, else
             ``scene``.
         sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
+        advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
+        expectation_lr: learning rate of the copy of the denoiser that learns the mean of own samples; 0 takes the
+            sampling policy for it.
     """
 
     learning_rate: ClassVar[float] = 2e-4
@@ -135,12 +138,16 @@ class ForwardProcessSettings(AlgorithmSettings):
     credit: str = "auto"
     category_credit: str = "auto"
     sampler_decay: float = 0.9
+    advantage_clip: float = 2.0
+    expectation_lr: float = 3e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_at_least(self, 1, "updates", "draws")
         require_one_of(self, "credit", CREDITS)
         require_one_of(self, "category_credit", CATEGORY_CREDITS)
+        require_positive(self, "advantage_clip")
+        require_at_least(self, 0, "expectation_lr")
         if not 0 <= self.sampler_decay < 1:
             raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
 
@@ -150,21 +157,15 @@ class NFTSettings(ForwardProcessSettings):
     """NFT: good samples pull, bad samples push, both within bounds (Zheng et al. 2025).
 
     Attributes:
-        beta: strength; smaller ones step further from the sampling policy.
-        advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
-        expectation_lr: learning rate of the copy of the denoiser that learns the mean of own samples; 0 takes the
-            sampling policy for it.
+        beta: strength; smaller values step further from the sampling policy.
     """
 
     name: str = "nft"
     beta: float = 0.5
-    advantage_clip: float = 2.0
-    expectation_lr: float = 3e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive(self, "beta", "advantage_clip")
-        require_at_least(self, 0, "expectation_lr")
+        require_positive(self, "beta")
 
 
 @dataclass
@@ -173,19 +174,13 @@ class AWMSettings(ForwardProcessSettings):
 
     Attributes:
         beta: strength of the pull to the sampling policy, above 1.
-        advantage_clip: largest advantage, in standard deviations.
-        expectation_lr: the setting of the same name of ``nft``.
     """
 
     name: str = "awm"
     beta: float = 2.0
-    advantage_clip: float = 2.0
-    expectation_lr: float = 3e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive(self, "advantage_clip")
-        require_at_least(self, 0, "expectation_lr")
         if not self.beta > 1:
             raise InvalidInputError(f"beta={self.beta} must be above 1: below, a bad sample pushes without bound")
 
@@ -226,7 +221,7 @@ class GuidanceDistillationSettings(AlgorithmSettings):
 ENTRY_POINT_GROUP = "scene_envs.algorithms"
 """Entry points of installed packages: modules that call :func:`register_algorithm` when they are imported."""
 
-Algorithm = TypeVar("Algorithm", bound=type)
+AlgorithmClass = TypeVar("AlgorithmClass", bound=type)
 
 
 @dataclass(frozen=True)
@@ -254,12 +249,11 @@ _ALGORITHMS = Registry(
 
 def register_algorithm(
     name: str, settings: type[AlgorithmSettings] = DDPOSFSettings
-) -> Callable[[Algorithm], Algorithm]:
+) -> Callable[[AlgorithmClass], AlgorithmClass]:
     """Make an algorithm available as ``algorithm=name``; the same name again replaces it.
 
-    The decorated class takes ``(settings, policy, stds)`` and extends
-    :class:`~agents.post_training.algorithms.base.Algorithm` or one of its subclasses, such as
-    :class:`agents.post_training.DDPO`.
+    The decorated class takes ``(settings, policy, stds)`` and extends :class:`agents.post_training.Algorithm` or one
+    of its subclasses, such as :class:`agents.post_training.DDPO`.
 
     Args:
         name: name of letters, digits and underscores.
@@ -295,21 +289,6 @@ def make_algorithm(settings: AlgorithmSettings, policy: Any, stds: Any) -> Any:
     return code(settings, policy, stds)
 
 
-LOWEST, HIGHEST = 0.01, 100.0
-"""Bounds of the factor."""
-GAIN = 0.05
-"""Change of the factor's logarithm per iteration if the figure's excess over its base value is twice the target's."""
-LOOK_AHEAD = 30.0
-"""Iterations by which a measurement is extrapolated, because the weights act with a delay."""
-SMOOTHING = 10.0
-"""Iterations over which the figure's change per iteration is averaged."""
-LARGEST_ERROR = 3.0
-FAR = 0.5
-"""A target counts as not held at the end if the error of the last measurement is larger than this."""
-PATIENCE = 3
-"""Measurements in a row above the target, with the factor at its upper bound, after which the target is not held."""
-
-
 def held_ratio(text: str) -> float:
     """Ratio of the held-out loss to the base prior's that a text ``guard:RATIO`` names.
 
@@ -332,74 +311,6 @@ def held_ratio(text: str) -> float:
     return ratio
 
 
-def relative_error(target: float, measured: float) -> float:
-    """Measured ratio minus target, divided by target minus 1: 0 at the target, -1 at the base prior's ratio."""
-    error = (measured - 1.0) / (target - 1.0) - 1.0
-    return max(-1.0, min(error, LARGEST_ERROR)) if error == error else LARGEST_ERROR
-
-
-@dataclass(frozen=True)
-class HoldState:
-    """State of the controller; plain numbers, for checkpoints.
-
-    Attributes:
-        log_factor: logarithm of the factor on the weight of the regularisation.
-        iteration: of the last measurement.
-        measured: the last value; None before the first.
-        slope: its change per iteration, averaged.
-        beyond: measurements in a row that were above the target while the factor was at its upper bound.
-        lost_at: iteration from which the target counts as not held; None while it counts as held.
-    """
-
-    log_factor: float = 0.0
-    iteration: int = 0
-    measured: float | None = None
-    slope: float = 0.0
-    beyond: int = 0
-    lost_at: int | None = None
-
-    @property
-    def factor(self) -> float:
-        """Factor on the weight."""
-        return math.exp(self.log_factor)
-
-    def returned(self, measured: float) -> HoldState:
-        """The state after a return to an earlier checkpoint of ratio ``measured``, which is no change by training."""
-        return replace(self, measured=measured, slope=0.0)
-
-
-def adjust(state: HoldState, target: float, measured: float, iteration: int) -> HoldState:
-    """The state after a measurement: integral control of the factor's logarithm, within bounds.
-
-    It is the controller of Ziegler et al. (2019, Eq. 4) with two changes. The gain is per iteration, so that checks
-    may come at any distance. The figure is extrapolated by ``LOOK_AHEAD`` iterations with its averaged change per
-    iteration. The error is bounded; an error that is not a number counts as the largest.
-
-    Args:
-        state: state before the measurement.
-        target: ratio that is held.
-        measured: ratio of the held-out loss to the base prior's now.
-        iteration: number of the finished iteration.
-
-    >>> state = adjust(HoldState(), 1.05, measured=1.1, iteration=1)
-    >>> round(state.factor, 3)
-    1.162
-    """
-    span = max(1, iteration - state.iteration)
-    first = measured if state.iteration else 1.0
-    before = first if state.measured is None else state.measured
-    slope = state.slope + (1.0 - math.exp(-span / SMOOTHING)) * ((measured - before) / span - state.slope)
-    slope = slope if math.isfinite(slope) else 0.0
-    error = relative_error(target, measured + LOOK_AHEAD * slope)
-    step = GAIN * span * error
-    log_factor = max(math.log(LOWEST), min(state.log_factor + step, math.log(HIGHEST)))
-    beyond = state.beyond + 1 if relative_error(target, measured) > 0 and log_factor >= math.log(HIGHEST) else 0
-    lost_at = iteration if state.lost_at is None and beyond >= PATIENCE else state.lost_at
-    return HoldState(log_factor, iteration, measured, slope, beyond, lost_at)
-
-
-SHARPNESS = 20.0
-"""Scale of the discriminative loss; with a larger value the prior moves less far from its base."""
 OBJECTIVES = ("pretraining", "discriminative")
 """Losses of the regularisation."""
 
@@ -470,7 +381,7 @@ class PostTrainOptimizerSettings(OptimizerSettings):
             super().__post_init__()
 
 
-FEWEST_SAMPLES = 20
+MIN_SAMPLES = 20
 """Samples that the guard's classifier needs."""
 
 
@@ -527,9 +438,9 @@ class GuardSettings:
 
     @property
     def sampled(self) -> int:
-        """Number of scenes that a check samples, at most that of the held-out scenes; 0 below ``FEWEST_SAMPLES``."""
+        """Number of scenes that a check samples, at most that of the held-out scenes; 0 below ``MIN_SAMPLES``."""
         count = min(self.samples, self.scenes)
-        return count if count >= FEWEST_SAMPLES else 0
+        return count if count >= MIN_SAMPLES else 0
 
     def sample_limits(self, defaults: Mapping[str, float]) -> dict[str, float]:
         """Limits of figures of samples by name; ``defaults`` are the algorithm's."""
@@ -666,6 +577,18 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
     def directory(self) -> Path:
         """The run directory."""
         return Path(self.output or "runs/post-train")
+
+    def resolved_reward(self) -> Any:
+        """The reward of a run, as :func:`rewards.process.run_reward` gives it; its caller closes it."""
+        from rewards.process import run_reward
+
+        return run_reward(
+            self.reward,
+            seed=self.seed,
+            timeout=self.reward_timeout,
+            memory=self.reward_memory,
+            workers=0 if self.workers == "ray" else self.workers,
+        )
 
     def plain(self) -> dict[str, Any]:
         """The configuration as numbers, strings and lists; a reward given as an object becomes its name."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from contextlib import nullcontext
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,176 +14,46 @@ import torch
 from tensordict import TensorDict
 from torch import Generator
 
+from agents.configuration.composition import config_text
 from agents.configuration.prior_names import short_name
 from agents.post_training.algorithms.base import no_credit_per_object
 from agents.post_training.guard import Guard, GuardReading, SampleCheck, realism
-from agents.post_training.learner import Learner, NonFiniteGradient, check_shares
+from agents.post_training.learner import Learner, NonFiniteGradient
+from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.real_scenes import SceneBank, kept_base_samples, kept_scenes
-from agents.post_training.rollouts import PromptSets, gathered_scenes, prompts_beside, reward_figures, stream_seed
+from agents.post_training.rollouts import PromptSets, gathered_scenes, reward_figures, run_prompts, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
     draw_curve,
     load_resumable,
-    run_metrics,
     run_progress,
-    write_config,
     write_log,
     write_metrics,
+    write_text,
     writing,
 )
 from agents.post_training.settings import PostTrainConfig
-from agents.priors.prior import ScenePrior, check_object_count
-from agents.utils.checkpoints import save_checkpoint
+from agents.priors.prior import ScenePrior, check_object_count, no_text
+from agents.utils.checkpoints import check_tensors, save_checkpoint
 from agents.utils.interrupts import finishing_steps
 from agents.utils.loggers import make_logger
 from agents.utils.process_group import ProcessGroup, launched_processes
+from agents.utils.weight_average import AveragedWeights
 from rewards import reward_label
 from scene_envs.errors import InvalidInputError, TrainingError
-from scene_envs.files import claimed
+from scene_envs.files import claimed, sealed
 from scene_envs.scene import SceneBatch
-
-_PROBED = 2
-"""Real scenes on which the reward of a run is tried."""
-_PROBED_WITH_PROMPTS = 8
-"""The same number in a run that uses the prompts of its real scenes."""
-
-
-def check_it_can_learn(learner: Learner, real: SceneBatch, prompts: PromptSets | None) -> None:
-    """Score real scenes as the scenes of the run will be scored.
-
-    Real scenes are scored with their own prompts if the run uses the prompts of real scenes, and with the prompts of
-    the run otherwise. With prompts that are not their own, it may be that no real scene can be scored. A run with such
-    prompts is therefore not refused if no real scene is scored.
-
-    Args:
-        learner: learner of the run, which can already deal prompts.
-        real: real scenes.
-        prompts: prompts of each real scene; None for a prior that reads no prompts.
-
-    Raises:
-        InvalidInputError: credit per object is asked of a reward that gives none, or the guard has a limit of
-            stacks for assets without geometry.
-        TrainingError: the reward scores none of the real scenes.
-    """
-    config, scene_type = learner.config, learner.prior.scene_type
-    if config.guard.limits.stack is not None and not scene_type.has_geometry:
-        raise InvalidInputError(
-            f"guard.limits.stack={config.guard.limits.stack} needs the geometry of the assets, and those of "
-            f"{scene_type.name!r} have none here; leave it out"
-        )
-    scenes, texts = _tried(learner, real, prompts)
-    score = learner.scorer(scenes, texts)
-    valid = bool(score.valid.any())
-    if valid and score.per_object is None and getattr(config.algorithm, "credit", "") == "object":
-        raise no_credit_per_object()
-    if config.prompt in (None, "data") and not learner.processes.any(valid):
-        pairs = "" if texts is None else " with a prompt"
-        raise nothing_scored(config, f"none of {len(scenes)} real scenes{pairs}, so that nothing was sampled")
-
-
-def nothing_scored(config: PostTrainConfig, what: str) -> TrainingError:
-    """The error for a run whose reward scored ``what``."""
-    return TrainingError(
-        f"the reward {config.plain()['reward']!r} scored {what}; the warnings above say why, and "
-        "`scene-envs check-reward` tries a reward on its own"
-    )
-
-
-def _tried(learner: Learner, real: SceneBatch, prompts: PromptSets | None) -> tuple[SceneBatch, list[str] | None]:
-    """The first real scenes and a prompt for each, None in a run without prompts.
-
-    If the run uses the prompts of real scenes, more scenes are tried, each with all of its prompts, because a reward
-    may read only one kind of prompt.
-    """
-    if learner.config.prompt == "data" and prompts is not None:
-        pairs = [(row, text) for row in range(min(_PROBED_WITH_PROMPTS, len(real))) for text in prompts(row)]
-        return real[torch.tensor([row for row, _ in pairs])], [text for _, text in pairs]
-    scenes = real[:_PROBED]
-    if learner.deck is None:
-        return scenes, None
-    return scenes, learner.deck.deal(len(scenes), Generator().manual_seed(learner.config.seed))
-
-
-_PICTURED = 6
-"""Number of the guard's samples that are kept for the report."""
-
-
-def make_guard(config: PostTrainConfig, learner: Learner, scenes: SceneBank) -> Guard:
-    """The guard of a run; it samples if the configuration says so."""
-    asked, count, check = scenes.heldout_prompts(), config.guard.sampled, None
-    if count:
-        check = SampleCheck(
-            learner.prior.decode(scenes.heldout[:count]).to("cpu"),
-            learner.scorer,
-            count,
-            config.num_steps,
-            stream_seed(config.seed, "samples"),
-            learner.slots,
-            None if config.prompt is None else scenes.heldout_prompts(count, learner.slots, learner.prior.scene_type),
-            config.guidance,
-            config.claim_guidance,
-        )
-    limits = config.guard.sample_limits(config.algorithm.sample_limits)
-    held = config.regularisation.target
-    target = math.inf if held is None else held
-    seed, learns = stream_seed(config.seed, "guard"), bool(learner.learned)
-    return Guard(scenes.heldout, config.guard.limit, seed, asked, check, limits, target, learns)
-
-
-class GuardFiles:
-    """Files of the guard in a run's folder; only the first process writes.
-
-    Args:
-        config: configuration of the run.
-        base: name of the base prior; empty for a prior that was not loaded by name.
-    """
-
-    def __init__(self, config: PostTrainConfig, base: str) -> None:
-        self.directory = config.directory
-        self._facts: dict[str, Any] = {
-            "algorithm": config.algorithm.name,
-            **({"base": short_name(base)} if base else {}),
-            "reward": config.plain()["reward"],
-        }
-        self._processes = ProcessGroup.current()
-
-    def keep(self, prior: ScenePrior, guard: Guard, iteration: int) -> None:
-        """Write the evaluated weights to ``prior/``, with a card that says how they were made."""
-        # figures of the base prior are not those of other weights
-        unknown = ("measures", "limits") if iteration else ()
-        prior.card = {
-            **{key: value for key, value in prior.card.items() if key not in unknown},
-            "post_training": {
-                **self._facts,
-                "iteration": iteration,
-                "mean_reward": guard.best_reward if iteration else None,
-                "guard_ratio": guard.ratio,
-            },
-        }
-        path = self.directory / "prior"
-        if self._processes.is_first:
-            writing(f"the prior {str(path)!r}", lambda: prior.save(path))
-
-    def best(self) -> ScenePrior:
-        """The prior that was kept last."""
-        self._processes.wait()  # until it is written
-        return ScenePrior.load(self.directory / "prior")
-
-    def picture(self, guard: Guard, reading: GuardReading) -> None:
-        """Keep the samples of the best checkpoint, and of the first check beyond a limit, for the report."""
-        batch = guard.last_samples
-        name = "guard_within" if reading.kept else "guard_beyond"
-        first = reading.beyond and guard.over_limit_at == reading.iteration
-        if batch is None or not reading.samples or not (reading.kept or first) or not self._processes.is_first:
-            return
-        path = self.directory / f"{name}.safetensors"
-        writing(f"the guard's samples {str(path)!r}", lambda: batch[:_PICTURED].save(path))
-
 
 MAX_INVALID = 3
 """Consecutive batches without a valid reward after which a run stops."""
 _MAX_ROLLBACKS = 3
 """Number of returns to the best checkpoint that a run may make; one more ends it."""
+_PROBED = 2
+"""Real scenes on which the reward of a run is tried."""
+_PROBED_WITH_PROMPTS = 8
+"""The same number in a run that uses the prompts of its real scenes."""
+_PICTURED = 6
+"""Number of the guard's samples that are kept for the report."""
 
 
 @dataclass(frozen=True)
@@ -231,7 +102,7 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     >>> len(result.history), result.history[0]["log_ratio"]
     (2, 0.0)
     """
-    check_shares(config, launched_processes())
+    _check_shares(config.batch_size, launched_processes())
     processes = ProcessGroup.join(config.device)
     with claimed(config.directory, "post_train") if processes.is_first else nullcontext():
         trainer = PostTrainer(config, prior=prior)
@@ -239,6 +110,16 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
             return trainer.run()
         finally:
             trainer.close()
+
+
+def _check_shares(batch_size: int, processes: int) -> None:
+    if batch_size % processes:
+        lower = batch_size // processes * processes
+        nearest = f"{lower} or {lower + processes}" if lower else str(processes)
+        raise InvalidInputError(
+            f"batch_size={batch_size} is not a multiple of {processes}, the number of processes; give "
+            f"batch_size={nearest}, or another number of processes"
+        )
 
 
 class PostTrainer:
@@ -253,13 +134,23 @@ class PostTrainer:
     scenes: SceneBank
 
     def __init__(self, config: PostTrainConfig, *, prior: ScenePrior | None = None) -> None:
-        self.config = config
+        self.config, self.plain = config, config.plain()
         self.directory = config.directory
         self.processes = ProcessGroup.current()
         base = ScenePrior.load(config.prior if prior is None else prior)
-        self.files = GuardFiles(config, base.loaded_as)
-        self.learner = Learner(config, base)
-        self.prior = self.learner.prior
+        if config.prompt is not None and not base.conditional:
+            raise no_text(base.scene_type, str(config.prompt))
+        self.base_name = short_name(base.loaded_as) if base.loaded_as else ""
+        self.prior = deepcopy(base).to(config.device).eval()
+        policy = DenoisingPolicy(
+            self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,
+            claim_guidance=config.claim_guidance,
+        )  # fmt: skip
+        self.learner = Learner(
+            policy, config.resolved_reward(), config.algorithm, config.optimizer, config.regularisation,
+            batch_size=config.batch_size, slots=config.slots, prompt=config.prompt, workers=config.workers,
+            seed=config.seed,
+        )  # fmt: skip
         self.iteration = 0
         self.invalid_streak = 0
         self.rollbacks = 0
@@ -277,15 +168,15 @@ class PostTrainer:
     def run(self) -> PostTrainResult:
         """Train until ``config.iterations``, or until the guard stops the run; the result holds the best prior."""
         config = self.config
-        state = load_resumable(self.directory, config)
+        state = load_resumable(self.directory, self.plain)
         self.prepare(reuse_scenes=state is not None)
         if state is not None:
             self._restore(state)
         else:
             if self.processes.is_first:
-                write_config(self.directory, config)
+                write_text(self.directory / "config.yaml", sealed(config_text(self.plain)))
             self.guard.start(self.prior)
-            self.files.keep(self.prior, self.guard, 0)  # the best prior so far is the base
+            self._keep(self.prior)  # the best prior so far is the base
         title = f"post-train {self.prior.scene_type.name}"
         started = time.perf_counter() - self.seconds
         self._write_log()  # removes the rows of an earlier run, or rows beyond the checkpoint
@@ -325,7 +216,7 @@ class PostTrainer:
         )
         prompts: PromptSets | None = None
         if self.prior.conditional:
-            prompts = prompts_beside(self.directory, batch, seed)
+            prompts = run_prompts(self.directory, batch, seed)
             if config.prompt == "data":
                 large = torch.nonzero(batch.counts > slots)[:, 0].tolist()
                 check_object_count([text for i in large for text in prompts(i)], self.prior.scene_type, slots)
@@ -334,12 +225,70 @@ class PostTrainer:
         self.learner.deal_prompts(self.scenes)
         self.learner.begin_rewards(batch[: len(self.scenes.train)], first=not reuse_scenes)
         if not reuse_scenes:
-            check_it_can_learn(self.learner, batch, prompts)
+            self._try_reward(batch, prompts)
         base = self.learner.regularisation.base
-        if base is not None and config.regularisation.objective == "discriminative":
-            samples = kept_base_samples(self.directory, base, self.scenes, config, reuse=reuse_scenes, progress=shown)
+        if base is not None:
+            samples = kept_base_samples(
+                self.directory, base, self.scenes, config.regularisation.base_samples, config.seed,
+                num_steps=config.num_steps, batch_size=config.batch_size, reuse=reuse_scenes, progress=shown,
+            )  # fmt: skip
             self.scenes = replace(self.scenes, base=samples)
-        self.guard = make_guard(config, self.learner, self.scenes)
+        self.guard = self._make_guard()
+
+    def _try_reward(self, real: SceneBatch, prompts: PromptSets | None) -> None:
+        """Score real scenes as the scenes of the run will be scored.
+
+        Real scenes are scored with their own prompts if the run uses the prompts of real scenes; more scenes are then
+        tried, each with all of its prompts, because a reward may read only one kind of prompt. Otherwise they are
+        scored with the prompts of the run, with which it may be that no real scene can be scored; such a run is not
+        refused.
+        """
+        config, learner, scene_type = self.config, self.learner, self.prior.scene_type
+        if config.guard.limits.stack is not None and not scene_type.has_geometry:
+            raise InvalidInputError(
+                f"guard.limits.stack={config.guard.limits.stack} needs the geometry of the assets, and those of "
+                f"{scene_type.name!r} have none here; leave it out"
+            )
+        scenes, texts = real[:_PROBED], None
+        if config.prompt == "data" and prompts is not None:
+            pairs = [(row, text) for row in range(min(_PROBED_WITH_PROMPTS, len(real))) for text in prompts(row)]
+            scenes, texts = real[torch.tensor([row for row, _ in pairs])], [text for _, text in pairs]
+        elif learner.deck is not None:
+            texts = learner.deck.deal(len(scenes), Generator().manual_seed(config.seed))
+        score = learner.scorer(scenes, texts)
+        valid = bool(score.valid.any())
+        if valid and score.per_object is None and getattr(config.algorithm, "credit", "") == "object":
+            raise no_credit_per_object()
+        if config.prompt in (None, "data") and not self.processes.any(valid):
+            paired = "" if texts is None else " with a prompt"
+            raise self._nothing_scored(f"none of {len(scenes)} real scenes{paired}, so that nothing was sampled")
+
+    def _make_guard(self) -> Guard:
+        config, scenes, slots = self.config, self.scenes, self.learner.slots
+        count, check = config.guard.sampled, None
+        if count:
+            check = SampleCheck(
+                self.prior.decode(scenes.heldout[:count]).to("cpu"),
+                self.learner.scorer,
+                count,
+                config.num_steps,
+                stream_seed(config.seed, "samples"),
+                slots,
+                None if config.prompt is None else scenes.heldout_prompts(count, slots, self.prior.scene_type),
+                config.guidance,
+                config.claim_guidance,
+            )
+        target = config.regularisation.target
+        return Guard(
+            scenes.heldout,
+            config.guard.limit,
+            stream_seed(config.seed, "guard"),
+            scenes.heldout_prompts(),
+            check,
+            config.guard.sample_limits(config.algorithm.sample_limits),
+            math.inf if target is None else target,
+            bool(self.learner.learned),
+        )
 
     def step(self) -> tuple[TensorDict, dict[str, float]]:
         """One iteration: a batch of fresh scenes and its updates. Returns the batch and the row for the log."""
@@ -350,7 +299,7 @@ class PostTrainer:
             row |= self._learn(batch)
         else:
             self._count_invalid()
-        self.learner.learned.learn(batch)
+        self.learner.learn_rewards(batch)
         self.iteration += 1
         return batch, row
 
@@ -380,28 +329,33 @@ class PostTrainer:
         recent = [row["reward"] for row in self.history[since:] if math.isfinite(row["reward"])]
         reward = sum(recent) / len(recent) if recent else float("nan")
         scenes = gathered_scenes(batch)
-        with self.learner.averaged() as prior:
+        with AveragedWeights(self.prior, self.learner.algorithm.average) as prior:
             reading = self.guard.check(prior, self.iteration, reward, realism(scenes), sample=sample)
             if reading.kept:
-                self.files.keep(prior, self.guard, self.iteration)
+                self._keep(prior)
         self.learner.regularisation.observe(reading.ratio, self.iteration)
         figures = {f"guard_{name}": value for name, value in reading.samples.items()}
         self.history[-1] |= {"guard_loss": reading.loss, "guard_ratio": reading.ratio, **figures, **reading.realism}
-        self.files.picture(self.guard, reading)
+        self._picture(reading)
         if reading.beyond and self.config.guard.action == "rollback":
             self.rollbacks += 1
-            self.learner.return_to(self.files.best())
+            self.learner.return_to(self._best())
             self.learner.regularisation.return_to_checkpoint(self.guard.best_ratio)
 
     def _count_invalid(self) -> None:
         self.invalid_streak += 1
         if self.iteration == 0:
-            raise nothing_scored(self.config, "no scene of the first batch")
+            raise self._nothing_scored("no scene of the first batch")
         if self.invalid_streak >= MAX_INVALID:
-            raise nothing_scored(
-                self.config,
-                f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}",
+            raise self._nothing_scored(
+                f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}"
             )
+
+    def _nothing_scored(self, what: str) -> TrainingError:
+        return TrainingError(
+            f"the reward {self.plain['reward']!r} scored {what}; the warnings above say why, and "
+            "`scene-envs check-reward` tries a reward on its own"
+        )
 
     def _not_finite(self, figures: dict[str, float]) -> TrainingError:
         numbers = ", ".join(f"{name} {figures[name]:.3g}" for name in ("policy_loss", "pretraining_loss"))
@@ -413,12 +367,45 @@ class PostTrainer:
 
     # -- files ----------------------------------------------------------------------------------
 
+    def _keep(self, prior: ScenePrior) -> None:
+        """Write the evaluated weights to ``prior/``, with a card that says how they were made."""
+        # figures of the base prior are not those of other weights
+        unknown = ("measures", "limits") if self.iteration else ()
+        prior.card = {
+            **{key: value for key, value in prior.card.items() if key not in unknown},
+            "post_training": {
+                "algorithm": self.config.algorithm.name,
+                **({"base": self.base_name} if self.base_name else {}),
+                "reward": self.plain["reward"],
+                "iteration": self.iteration,
+                "mean_reward": self.guard.best_reward if self.iteration else None,
+                "guard_ratio": self.guard.ratio,
+            },
+        }
+        path = self.directory / "prior"
+        if self.processes.is_first:
+            writing(f"the prior {str(path)!r}", lambda: prior.save(path))
+
+    def _best(self) -> ScenePrior:
+        """The prior that was kept last."""
+        self.processes.wait()  # until it is written
+        return ScenePrior.load(self.directory / "prior")
+
+    def _picture(self, reading: GuardReading) -> None:
+        """Keep the samples of the best checkpoint, and of the first check beyond a limit, for the report."""
+        batch = self.guard.last_samples
+        first = reading.beyond and self.guard.over_limit_at == reading.iteration
+        if batch is None or not reading.samples or not (reading.kept or first) or not self.processes.is_first:
+            return
+        path = self.directory / f"{'guard_within' if reading.kept else 'guard_beyond'}.safetensors"
+        writing(f"the guard's samples {str(path)!r}", lambda: batch[:_PICTURED].save(path))
+
     def save(self) -> None:
         """Write the resumable checkpoint, which is the same in all processes."""
         if not self.processes.is_first:
             return
         state = {
-            "config": self.config.plain(),
+            "config": self.plain,
             "iteration": self.iteration,
             "invalid_streak": self.invalid_streak,
             "rollbacks": self.rollbacks,
@@ -438,12 +425,24 @@ class PostTrainer:
         self.rollbacks = state["rollbacks"]
         self.seconds, self.history = state["seconds"], list(state["history"])
         self.guard.restore(state["guard"])
+        check_tensors(self.prior, state["learner"]["prior"], self.directory / CHECKPOINT_NAME)
         self.learner.restore(state["learner"])
 
     def _finish(self) -> PostTrainResult:
-        guard = {**self.guard.summary(), "rollbacks": self.rollbacks}
-        metrics = run_metrics(self.history, self.config.batch_size, self.seconds, self.guard.best_reward, guard)
-        metrics["hold"] = self.learner.regularisation.summary()
+        rewards = [row["reward"] for row in self.history if math.isfinite(row["reward"])]
+        invalid = sum((1.0 - row["valid_fraction"]) * self.config.batch_size for row in self.history)
+        metrics = {
+            "iterations": len(self.history),
+            "seconds": round(self.seconds, 1),
+            "reward": {
+                "first": rewards[0] if rewards else None,
+                "last": rewards[-1] if rewards else None,
+                "best": self.guard.best_reward,
+                "invalid_scenes": round(invalid),
+            },
+            "guard": {**self.guard.summary(), "rollbacks": self.rollbacks},
+            "hold": self.learner.regularisation.summary(),
+        }
         if self.processes.is_first:
             write_metrics(self.directory, metrics)
             draw_curve(
@@ -454,4 +453,4 @@ class PostTrainer:
                 beyond=self.guard.over_limit_at,
                 highest=self.learner.largest_reward(),
             )
-        return PostTrainResult(self.files.best(), self.history, metrics, self.directory, self.config)
+        return PostTrainResult(self._best(), self.history, metrics, self.directory, self.config)

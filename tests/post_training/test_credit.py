@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 
-from agents.post_training.learner import Learner
+from agents.post_training import PostTrainer
 from agents.post_training.rollouts import finished_scenes
 from agents.priors.testing import tiny_prior
 from rewards import WeightedSum
@@ -34,7 +34,8 @@ class LeftHalf:
 
 @pytest.mark.parametrize("averages", [False, True])
 def test_an_empty_slot_has_credit_under_a_sum_alone(tmp_path: Path, averages: bool) -> None:
-    learner = Learner(small_config(tmp_path, reward=LeftHalf(averages), batch_size=12), tiny_prior())
+    config = small_config(tmp_path, reward=LeftHalf(averages), batch_size=12)
+    learner = PostTrainer(config, prior=tiny_prior()).learner
     try:
         batch = learner.write_advantage(learner.rollout(0))
     finally:
@@ -59,7 +60,8 @@ def test_an_empty_slot_has_credit_under_a_sum_alone(tmp_path: Path, averages: bo
 def _credit_in_rooms(folder: Path, reward: Any, algorithm: str) -> tuple[SceneBatch, torch.Tensor, torch.Tensor]:
     """Samples of an untrained prior of rooms, and the credit and the advantage of their poses (B, N)."""
     prior = tiny_prior("restaurant_low_clutter", process="mixed", seed=3)
-    learner = Learner(small_config(folder, reward=reward, batch_size=12, algorithm={"name": algorithm}), prior)
+    config = small_config(folder, reward=reward, batch_size=12, algorithm={"name": algorithm})
+    learner = PostTrainer(config, prior=prior).learner
     try:
         batch = learner.write_advantage(learner.rollout(0))
     finally:
@@ -99,7 +101,7 @@ def test_furniture_that_overlaps_furniture_is_blamed(tmp_path: Path, algorithm: 
 )
 def test_categories_have_credit_if_the_reward_counts_objects(tmp_path: Path, reward: Any, counts: bool) -> None:
     config = small_config(tmp_path, reward=reward, algorithm={"name": "nft"}, slots=12)
-    learner = Learner(config, tiny_prior(process="mixed"))
+    learner = PostTrainer(config, prior=tiny_prior(process="mixed")).learner
     try:
         batch = learner.write_advantage(learner.rollout(0))
     finally:

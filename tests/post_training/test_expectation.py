@@ -9,8 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Generator, Tensor
 
-from agents.post_training.algorithms.base import Expectation
-from agents.post_training.algorithms.forward_process import AWMLoss, NFTLoss
+from agents.post_training.algorithms.forward_process import AWMLoss, Expectation, NFTLoss
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 

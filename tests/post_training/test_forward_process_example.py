@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from agents.post_training import NFTLoss, PostTrainer, compute_advantages
-from agents.post_training.algorithms.base import Expectation
+from agents.post_training.algorithms.forward_process import Expectation
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from agents.utils.weight_average import WeightAverage

@@ -200,11 +200,11 @@ def test_a_rollback_takes_every_part_of_the_algorithm_back(tmp_path: Path) -> No
     trainer.run()
     algorithm = trainer.learner.algorithm
     assert isinstance(algorithm, ForwardProcess)
-    assert algorithm.copy is not None
+    assert algorithm.expectation is not None
     base = tiny_prior(process="mixed").state_dict()
-    for prior in (trainer.prior, algorithm.sampler, algorithm.copy.prior):
+    for prior in (trainer.prior, algorithm.sampler, algorithm.expectation.prior):
         assert all(torch.equal(base[name], tensor) for name, tensor in prior.state_dict().items())
-    assert not algorithm.copy.optimizer.state
+    assert not algorithm.expectation.optimizer.state
     trainer.close()
 
 

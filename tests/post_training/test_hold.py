@@ -14,8 +14,8 @@ import torch
 from agents.cli.keys import compose
 from agents.configuration.composition import changed
 from agents.post_training import PostTrainConfig, post_train, post_train_and_compare
-from agents.post_training.regularisation import Regularisation
-from agents.post_training.settings import HIGHEST, LOWEST, HoldState, RegularisationSettings, adjust, algorithm_settings
+from agents.post_training.regularisation import MAX_FACTOR, MIN_FACTOR, HoldState, Regularisation, adjust
+from agents.post_training.settings import RegularisationSettings, algorithm_settings
 from agents.post_training.trainer import PostTrainer
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import SceneEnvsError
@@ -70,7 +70,7 @@ def test_no_checkpoint_beyond_a_held_ratio_is_kept(tmp_path: Path, hold: str | N
 
 
 @pytest.mark.parametrize(
-    ("measured", "bound", "lost"), [(2.0, HIGHEST, True), (1.0, LOWEST, False), (math.nan, HIGHEST, True)]
+    ("measured", "bound", "lost"), [(2.0, MAX_FACTOR, True), (1.0, MIN_FACTOR, False), (math.nan, MAX_FACTOR, True)]
 )
 def test_the_factor_stays_within_its_bounds(measured: float, bound: float, lost: bool) -> None:
     """Only a figure above the target at the upper bound is one that could not be held."""
@@ -154,7 +154,7 @@ def test_a_killed_run_goes_on_with_the_weight_it_had(tmp_path: Path, hold: str, 
 def test_a_target_that_cannot_be_held_is_said_in_log_metrics_and_report(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("agents.post_training.settings.HIGHEST", 1.1)
+    monkeypatch.setattr("agents.post_training.regularisation.MAX_FACTOR", 1.1)
     config = _run(tmp_path, "ddpo_sf", regularisation__hold="guard:1.001", guard__every=1, optimizer__lr=0.05)
     with caplog.at_level(logging.WARNING):
         metrics = post_train_and_compare(config, scenes=2, num_steps=2, prior=tiny_prior(slots=6))

@@ -147,7 +147,7 @@ def test_a_reward_that_learns_is_measured_as_the_run_left_it(tmp_path: Path, mon
     prior = tiny_prior(process="mixed", slots=6)
     post_train(config, prior=prior)
     reward, batch = make_reward("discriminator"), prior.sample(3, num_steps=4)
-    load_learned_rewards(reward, config)
+    load_learned_rewards(reward, tmp_path, config.guard.scenes, config.seed)
     assert bool((reward(batch, RewardContext()).value != 0.5).all())  # that of a network that has seen no samples
 
 

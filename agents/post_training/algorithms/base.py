@@ -1,9 +1,10 @@
-"""Base class of post-training algorithms: the interface that the training loop uses."""
+"""Base classes of post-training algorithms, sums of gradients, and advantages."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,18 +12,16 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Generator, Tensor, nn
 from torchrl.objectives import LossModule
 
 from agents.networks.text import Text
 from agents.post_training.policy import DenoisingPolicy
-from agents.priors.prior import NoisedScenes, ScenePrior
+from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup, gather_rows
 from agents.utils.weight_average import WeightAverage
 from scene_envs.errors import InvalidInputError
-
-SceneLoss = Callable[[NoisedScenes, Text | None], Tensor]
-"""(B,) losses of noised scenes and their prompts."""
 
 
 @dataclass(frozen=True)
@@ -37,129 +36,14 @@ class BatchGradient:
     loss: float
     columns: Mapping[str, float] = field(default_factory=dict)
 
-    def figures(self) -> Mapping[str, float]:
-        """Further columns of the log."""
-        return self.columns
-
-
-class GradientSum:
-    """Sum of the gradients of parts of a batch, each of which is complete before it is added.
-
-    The sum of two parts is the same, bit for bit, in one process as in two processes with one part each.
-
-    Args:
-        parameters: parameters whose ``.grad`` is summed; a gradient that is there already is the first part.
-
-    >>> weight = nn.Parameter(torch.ones(1))
-    >>> total = GradientSum([weight])
-    >>> for factor in (2.0, 3.0):
-    ...     (factor * weight).sum().backward()
-    ...     total.add_part()
-    >>> total.write()
-    >>> weight.grad
-    tensor([5.])
-    """
-
-    def __init__(self, parameters: Iterable[nn.Parameter]) -> None:
-        self._parameters = [p for p in parameters if p.requires_grad]
-        self._total: list[Tensor | None] = [None] * len(self._parameters)
-        self.add_part()
-
-    def add_part(self) -> None:
-        """Add ``.grad`` to the sum, and clear it."""
-        for index, parameter in enumerate(self._parameters):
-            before, gradient = self._total[index], parameter.grad
-            self._total[index] = before if gradient is None else gradient if before is None else before.add_(gradient)
-            parameter.grad = None
-
-    def write(self) -> None:
-        """Put the sum into ``.grad``."""
-        for parameter, total in zip(self._parameters, self._total, strict=True):
-            parameter.grad = total
-
-
-def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[int], float]:
-    """``count`` distinct steps of positive weight, and the factor that scales their sum to all such steps."""
-    eligible = torch.nonzero(weights > 0).flatten()
-    chosen = eligible[torch.randperm(len(eligible), generator=generator)[:count]]
-    return sorted(chosen.tolist()), len(eligible) / len(chosen)
-
-
-def add_regularisation_gradient(
-    prior: ScenePrior,
-    x0: Tensor,
-    coefficient: float,
-    generator: Generator,
-    *,
-    loss: SceneLoss | None = None,
-    chunk: int | None = None,
-    prompts: Sequence[str] | None = None,
-) -> tuple[float, float]:
-    """Add ``coefficient`` times the gradient of a loss of noised scenes to ``.grad``.
-
-    Args:
-        prior: the prior in training.
-        x0: (B, N, D) normalised scenes of all processes; each process takes its share of them.
-        coefficient: of the loss, which is a mean over scenes and entries.
-        generator: source of timesteps and noise (CPU).
-        loss: (B,) losses of noised scenes; None for the pretraining loss.
-        chunk: scenes per pass.
-        prompts: of the scenes, ``""`` for none; None for a prior that reads none.
-
-    Returns:
-        The mean loss of all scenes, and the norm of ``coefficient`` times its gradient.
-    """
-    if coefficient == 0:
-        return 0.0, 0.0
-    processes, parameters = ProcessGroup.current(), [p for p in prior.parameters() if p.requires_grad]
-    before = [p.grad for p in parameters]
-    for parameter in parameters:
-        parameter.grad = None
-    value, total = 0.0, GradientSum(parameters)
-    noised, own = prior.noised(x0, generator), processes.rows(len(x0))
-    losses = loss or prior.noised_loss
-    size = chunk or len(x0)
-    for start in range(own.start, own.stop, size):
-        rows = slice(start, min(start + size, own.stop))
-        text = None if prompts is None else encoded(prior, prompts[rows])
-        mean = losses(noised.rows(rows), text).mean() * ((rows.stop - start) / len(x0))
-        value += float(mean.detach())
-        (coefficient * mean).backward()
-        total.add_part()
-    total.write()
-    processes.sum_gradients(parameters)
-    norm = gradient_norm(parameters)
-    for parameter, gradient in zip(parameters, before, strict=True):
-        if gradient is not None:
-            parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
-    return processes.sum_numbers(value)[0], norm
-
-
-def prompted_loss(prior: ScenePrior, x0: Tensor, prompts: Sequence[str] | None, generator: Generator | None) -> Tensor:
-    """(B,) pretraining losses of real scenes ``x0`` (B, N, D), given their prompts if there are any."""
-    text = None if prompts is None else encoded(prior, prompts)
-    return prior.pretraining_loss(x0, generator, "none", text=text)
-
-
-@torch.no_grad()
-def encoded(prior: ScenePrior, prompts: Sequence[str]) -> Text | None:
-    """Text of ``prompts`` without gradients; None for a prior that reads none."""
-    return prior.encode_prompts(prompts) if prior.conditional else None
-
-
-def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
-    """Euclidean norm of all ``.grad``; 0 when there is none."""
-    norms = [p.grad.norm() for p in parameters if p.grad is not None]
-    return float(torch.stack(norms).norm()) if norms else 0.0
-
 
 class Algorithm(ABC):
     """Rule that turns a batch of scenes into a gradient.
 
     Attributes:
-        policy: the reverse chain of the prior in training.
-        advantage: writes what the loss reads into a batch; None where the scenes are not weighted.
-        loss: the loss that is minimised.
+        policy: reverse chain of the prior in training.
+        advantage: module that writes the advantages which the loss reads; None where the scenes are not weighted.
+        loss: torchrl loss whose gradient trains the prior.
     """
 
     policy: DenoisingPolicy
@@ -200,6 +84,134 @@ class Algorithm(ABC):
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
         return
+
+
+class AveragedSampler(Algorithm):
+    """An algorithm that samples with a separate copy of the prior, whose weights are also evaluated and saved.
+
+    After each batch the copy moves towards the prior in training.
+
+    Args:
+        policy: policy that is optimised.
+        sampler_decay: final decay, per batch, of the weight average that samples.
+        warm_up: warm-up of the decay, see :class:`~agents.utils.weight_average.WeightAverage`.
+
+    Attributes:
+        prior: the prior in training.
+        sampler: the prior that samples.
+    """
+
+    def __init__(self, policy: DenoisingPolicy, *, sampler_decay: float, warm_up: float = 10.0) -> None:
+        self.policy = policy
+        self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
+        self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
+        self._sampling_policy = DenoisingPolicy(
+            self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance,
+            claim_guidance=policy.claim_guidance, independent=False,
+        )  # fmt: skip  # it needs no log-probabilities
+        self._average = WeightAverage(self.prior, sampler_decay, warm_up)
+
+    @property
+    def sampling_policy(self) -> DenoisingPolicy:
+        """The reverse chain of the copy that samples."""
+        return self._sampling_policy
+
+    @property
+    def average(self) -> WeightAverage:
+        """The weights of the copy that samples."""
+        return self._average
+
+    def end_iteration(self) -> None:
+        """Move the copy towards the prior in training."""
+        self._average.update(self.prior)
+        self._average.copy_to(self.sampler)
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Sample with the weights of ``prior``, and begin their average anew."""
+        self._average = WeightAverage(prior, self._average.decay, self._average.warm_up)
+        self._average.copy_to(self.sampler)
+
+    def state(self) -> dict[str, Any]:
+        """The weights of the copy, and the number of their updates."""
+        return {"sampler": self._average.tensors, "updates": self._average.updates}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        self._average.restore(state["sampler"], state["updates"])
+        self._average.copy_to(self.sampler)
+
+
+class PlainLoss(LossModule):
+    """A torchrl loss whose gradient goes to the modules' own parameters, and which has no value estimator.
+
+    Its accepted keys have ``text`` and ``text_mask``.
+    """
+
+    tensor_keys: Any
+
+    @property
+    def functional(self) -> bool:
+        """False: the modules' own parameters receive the gradient."""
+        return False
+
+    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
+        """Do nothing, because there is no value estimator."""
+
+    def _text(self, flat: TensorDictBase) -> Text | None:
+        """The text that the network attends to, as constants; None where there is none."""
+        tokens, mask = flat.get(self.tensor_keys.text, None), flat.get(self.tensor_keys.text_mask, None)
+        return None if tokens is None or mask is None else (tokens.detach(), mask)
+
+    def _advantage(self, flat: TensorDictBase, key: NestedKey, scene: Tensor) -> Tensor:
+        """(B, 1) or (B, N) advantages of scenes (B, N, D), as constants."""
+        found: Tensor = flat[key].detach().reshape(len(scene), -1)
+        if found.shape[1] not in (1, scene.shape[1]):
+            raise InvalidInputError(
+                f"{key!r} has {found.shape[1]} values per scene; give one, or one per slot ({scene.shape[1]})"
+            )
+        return found
+
+
+class GradientSum:
+    """Sum of the gradients of parts of a batch, each of which is complete before it is added.
+
+    The sum of two parts is the same, bit for bit, in one process as in two processes with one part each.
+
+    Args:
+        parameters: parameters whose ``.grad`` is summed; a gradient that is there already is the first part.
+
+    >>> weight = nn.Parameter(torch.ones(1))
+    >>> total = GradientSum([weight])
+    >>> for factor in (2.0, 3.0):
+    ...     (factor * weight).sum().backward()
+    ...     total.add_part()
+    >>> total.write()
+    >>> weight.grad
+    tensor([5.])
+    """
+
+    def __init__(self, parameters: Iterable[nn.Parameter]) -> None:
+        self._parameters = [p for p in parameters if p.requires_grad]
+        self._total: list[Tensor | None] = [None] * len(self._parameters)
+        self.add_part()
+
+    def add_part(self) -> None:
+        """Add ``.grad`` to the sum, and clear it."""
+        for index, parameter in enumerate(self._parameters):
+            before, gradient = self._total[index], parameter.grad
+            self._total[index] = before if gradient is None else gradient if before is None else before.add_(gradient)
+            parameter.grad = None
+
+    def write(self) -> None:
+        """Put the sum into ``.grad``."""
+        for parameter, total in zip(self._parameters, self._total, strict=True):
+            parameter.grad = total
+
+
+def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
+    """Euclidean norm of all ``.grad``; 0 when there is none."""
+    norms = [p.grad.norm() for p in parameters if p.grad is not None]
+    return float(torch.stack(norms).norm()) if norms else 0.0
 
 
 BASELINES = ("leave_one_out", "mean")
@@ -271,6 +283,47 @@ class Advantage(TensorDictModuleBase):
         return per_object.float(), credited & valid[:, None]
 
 
+class ForwardAdvantage(Advantage):
+    """Writes advantages that are not clipped, of poses and of categories.
+
+    Reads, in addition to the keys of :class:`Advantage`:
+        judged: (B, S, N) bool, optional. Slots that the reward does not judge have no advantage of their own: a table
+            of credit 0 would otherwise be repelled like an object that is not feasible.
+        counts_objects: (B, S, 1) bool, optional, whether the reward depends on which objects there are.
+
+    Writes, in addition:
+        category_advantage: (B, S, 1), the scene's advantage, or zeros for no credit.
+
+    Args:
+        credit: ``"scene"``, ``"object"`` or ``"auto"``, for poses.
+        category_credit: ``"scene"``, ``"none"``, or ``"auto"``: none where poses have credit per object and the reward
+            does not count objects.
+    """
+
+    out_keys = ["advantage", "category_advantage", "valid"]  # noqa: RUF012
+
+    def __init__(self, *, credit: str = "auto", category_credit: str = "auto") -> None:
+        super().__init__(credit=credit, clip=math.inf)
+        self.category_credit = category_credit
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``out_keys``."""
+        final = super().forward(tensordict)[:, -1]
+        per_object = self.credited(final)[0].ndim == 2
+        poses_alone = per_object and not bool(final.get("counts_objects", torch.zeros(1)).any())
+        if self.category_credit == "none" or (self.category_credit == "auto" and poses_alone):
+            categories = torch.zeros_like(final["advantage"][:, 0])
+        else:
+            categories = compute_advantages(*final_reward(final), clip=math.inf, groups=prompt_groups(final))
+        return tensordict.set("category_advantage", at_all_steps(categories, tensordict))
+
+    def credited(self, final: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Rewards of slots that are judged, or of scenes."""
+        reward, valid = super().credited(final)
+        judged = final.get("judged", None)
+        return reward, valid if reward.ndim == 1 or judged is None else valid & judged
+
+
 def last_steps(episodes: TensorDictBase) -> TensorDictBase:
     """The last transitions [B] of whole episodes [B, S].
 
@@ -303,9 +356,9 @@ def prompt_groups(final: TensorDictBase) -> Tensor | None:
     prompt = final.get("prompt", None)
     if prompt is None:
         return None
-    everywhere = gather_rows(prompt)
-    groups: Tensor = torch.unique(everywhere, dim=0, return_inverse=True)[1]
-    return groups[ProcessGroup.current().rows(len(everywhere))]
+    all_prompts = gather_rows(prompt)
+    groups: Tensor = torch.unique(all_prompts, dim=0, return_inverse=True)[1]
+    return groups[ProcessGroup.current().rows(len(all_prompts))]
 
 
 def no_credit_per_object() -> InvalidInputError:
@@ -381,124 +434,3 @@ def _expand(valid: Tensor, reward: Tensor) -> Tensor:
     while valid.ndim < reward.ndim:
         valid = valid.unsqueeze(-1)
     return valid.expand(reward.shape)
-
-
-class AveragedSampler(Algorithm):
-    """An algorithm that samples with a separate copy of the prior, whose weights are also evaluated and saved.
-
-    After each batch the copy moves towards the prior in training.
-
-    Args:
-        policy: policy that is optimised.
-        sampler_decay: final decay, per batch, of the weight average that samples.
-        warm_up: warm-up of the decay, see :class:`~agents.utils.weight_average.WeightAverage`.
-
-    Attributes:
-        prior: the prior in training.
-        sampler: the prior that samples.
-    """
-
-    def __init__(self, policy: DenoisingPolicy, *, sampler_decay: float, warm_up: float = 10.0) -> None:
-        self.policy = policy
-        self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
-        self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
-        self._sampling_policy = DenoisingPolicy(
-            self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance,
-            claim_guidance=policy.claim_guidance, independent=False,
-        )  # fmt: skip  # it needs no log-probabilities
-        self._average = WeightAverage(self.prior, sampler_decay, warm_up)
-
-    @property
-    def sampling_policy(self) -> DenoisingPolicy:
-        """The reverse chain of the copy that samples."""
-        return self._sampling_policy
-
-    @property
-    def average(self) -> WeightAverage:
-        """The weights of the copy that samples."""
-        return self._average
-
-    def end_iteration(self) -> None:
-        """Move the copy towards the prior in training."""
-        self._average.update(self.prior)
-        self._average.copy_to(self.sampler)
-
-    def return_to(self, prior: ScenePrior) -> None:
-        """Sample with the weights of ``prior``, and begin their average anew."""
-        self._average = WeightAverage(prior, self._average.decay, self._average.warm_up)
-        self._average.copy_to(self.sampler)
-
-    def state(self) -> dict[str, Any]:
-        """The weights of the copy, and the number of their updates."""
-        return {"sampler": self._average.tensors, "updates": self._average.updates}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Inverse of :meth:`state`."""
-        self._average.restore(state["sampler"], state["updates"])
-        self._average.copy_to(self.sampler)
-
-
-class Expectation(nn.Module):
-    """Mean target of a denoiser at a noised scene, over the scenes that the sampling policy makes.
-
-    A forward-process loss attracts the output to the targets of good samples, repels it from the targets of bad
-    samples, and takes the output of the sampling policy as the mean target. This output is not the mean, because a
-    policy in training is not an exact denoiser of its own samples. Where all samples are bad, the difference repels the
-    output, the sampling policy follows, and the difference grows. This copy of the denoiser learns the mean. Only the
-    covariance of target and advantage is then left, as in a policy gradient with an exact baseline.
-
-    Args:
-        prior: prior from which the denoiser is copied.
-        learning_rate: learning rate of AdamW.
-
-    >>> from agents.priors.testing import tiny_prior
-    >>> prior = tiny_prior("dimsum_table", process="mixed")
-    >>> noised = prior.noised(prior.encode(prior.sample(2, num_steps=3)))
-    >>> expectation = Expectation(prior)
-    >>> bool((expectation(noised) == prior.output(noised).continuous).all())
-    True
-    """
-
-    def __init__(self, prior: ScenePrior, learning_rate: float = 3e-4) -> None:
-        super().__init__()
-        self.prior = deepcopy(prior).requires_grad_(True)
-        self.prior.freeze_text()
-        self.trained = [p for p in self.prior.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.AdamW(self.trained, lr=learning_rate, weight_decay=0.0)
-
-    def forward(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
-        """(B, N, F) expected targets."""
-        return self.prior.output(noised, text).continuous
-
-    def step(self, clip: float = 1.0) -> None:
-        """Apply the gradient that all processes accumulated; one that is not finite is dropped."""
-        ProcessGroup.current().sum_gradients(self.trained)
-        if bool(torch.isfinite(nn.utils.clip_grad_norm_(self.trained, clip))):
-            self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-
-    def return_to(self, prior: ScenePrior) -> None:
-        """Take the weights of ``prior``, and forget the optimiser's state."""
-        self.prior.load_state_dict(prior.state_dict())
-        self.optimizer.state.clear()
-
-    def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
-        return {"weights": self.prior.state_dict(), "optimizer": self.optimizer.state_dict()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Inverse of :meth:`state`."""
-        self.prior.load_state_dict(state["weights"])
-        self.optimizer.load_state_dict(state["optimizer"])
-
-
-class PlainLoss(LossModule):
-    """A torchrl loss whose gradient goes to the modules' own parameters, and which has no value estimator."""
-
-    @property
-    def functional(self) -> bool:
-        """False: the modules' own parameters receive the gradient."""
-        return False
-
-    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        """Do nothing, because there is no value estimator."""

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Generator, Tensor
 
-from agents.post_training.algorithms.base import Advantage, Algorithm, BatchGradient, GradientSum, PlainLoss, draw_steps
+from agents.post_training.algorithms.base import Advantage, Algorithm, BatchGradient, GradientSum, PlainLoss
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.settings import DDPOISSettings, DDPOSFSettings
 from agents.utils.process_group import ProcessGroup
@@ -131,12 +131,14 @@ class DDPOSFLoss(PlainLoss):
         flat = tensordict.reshape(-1)
         scene, action = flat.get(keys.scene).detach(), flat.get(keys.action).detach()
         timestep = flat.get(keys.timestep).reshape(-1)
-        advantage = self._advantage(flat, scene.shape[:2])
+        advantage = self._advantage(flat, keys.advantage, scene)
         old = flat.get(keys.sample_log_prob, None)
         if old is None and self.clip_epsilon is not None:
             raise InvalidInputError(f"clipping needs the log-probabilities at sampling under {keys.sample_log_prob!r}")
         kept = self._kept(tensordict)
-        text = self._text(flat)
+        text, prompt = self._text(flat), flat.get(keys.prompt, None)
+        if text is None and prompt is not None:
+            text = self.policy.read(prompt)
         total = scene.new_zeros(())
         largest, clipped = scene.new_zeros(()), scene.new_zeros(())
         for t in timestep.unique().tolist():
@@ -186,23 +188,6 @@ class DDPOSFLoss(PlainLoss):
                 episode[..., step] &= ends[..., step] | episode[..., step + 1]
         return (kept & episode).reshape(-1)
 
-    def _text(self, flat: TensorDictBase) -> tuple[Tensor, Tensor] | None:
-        keys = self.tensor_keys
-        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
-        if tokens is not None and mask is not None:
-            return tokens.detach(), mask
-        prompt = flat.get(keys.prompt, None)
-        return None if prompt is None else self.policy.read(prompt)
-
-    def _advantage(self, flat: TensorDictBase, shape: torch.Size) -> Tensor:
-        advantage = flat.get(self.tensor_keys.advantage).detach()
-        advantage = advantage.reshape(shape[0], -1)
-        if advantage.shape[1] not in (1, shape[1]):
-            raise InvalidInputError(
-                f"the advantage has {advantage.shape[1]} values per scene; give one, or one per slot ({shape[1]})"
-            )
-        return advantage
-
     def _count_entries(self, slots: int) -> int:
         """Divisor of log-probabilities."""
         if self.reduction != "mean":
@@ -239,6 +224,13 @@ class DDPO(Algorithm):
         """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that enter it."""
         steps, scale = draw_steps(self.loss.step_weights.cpu(), self.settings.gradient_steps, generator)
         return accumulate_policy_gradient(self.loss, batch, steps, scale=scale)
+
+
+def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[int], float]:
+    """``count`` distinct steps of positive weight, and the factor that scales their sum to all such steps."""
+    eligible = torch.nonzero(weights > 0).flatten()
+    chosen = eligible[torch.randperm(len(eligible), generator=generator)[:count]]
+    return sorted(chosen.tolist()), len(eligible) / len(chosen)
 
 
 def accumulate_policy_gradient(

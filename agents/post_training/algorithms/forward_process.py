@@ -1,32 +1,25 @@
-"""Forward-process algorithms: sampling policy, advantages, and gradient of a batch."""
+"""Forward-process algorithms NFT and AWM: losses, mean of own samples, and gradient of a batch."""
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
-from collections import defaultdict
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
 from agents.networks.text import Text
 from agents.post_training.algorithms.base import (
-    Advantage,
     AveragedSampler,
     BatchGradient,
-    Expectation,
+    ForwardAdvantage,
     GradientSum,
     PlainLoss,
-    at_all_steps,
-    compute_advantages,
-    final_reward,
-    prompt_groups,
 )
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import finished_scenes
@@ -36,77 +29,7 @@ from agents.utils.process_group import ProcessGroup, gather_rows
 from scene_envs.errors import InvalidInputError
 
 
-class OwnSampleLoss(PlainLoss):
-    """A loss of finished scenes x_0; each call noises every scene once.
-
-    A subclass defines the losses of noised scenes. :meth:`forward` returns their means over the valid scenes.
-
-    Accepted keys (``set_keys``):
-        scene: (B, N, D) float, finished scenes x_0 as the prior encodes them. Default ``"scene"``.
-        timestep: (B,) or (B, 1) int64, optional; without it, drawn as in pretraining. Default ``"timestep"``.
-        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
-        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
-
-    Args:
-        prior: prior that noises the scenes.
-        generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
-
-    Returns (``forward``): ``loss_objective`` (), the loss of the prior in training, and ``loss_expectation`` (), the
-        loss of a trained copy of it. Each is 0 if the scenes do not train that model.
-    """
-
-    @dataclass
-    class _AcceptedKeys:
-        scene: NestedKey = "scene"
-        timestep: NestedKey = "timestep"
-        valid: NestedKey = "valid"
-        text: NestedKey = "text"
-        text_mask: NestedKey = "text_mask"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-    out_keys = ["loss_objective", "loss_expectation"]  # noqa: RUF012  (torchrl reads lists)
-    prior: ScenePrior
-    generator: Generator | None
-
-    def __init__(self, prior: ScenePrior, *, generator: Generator | None = None) -> None:
-        super().__init__()
-        self.prior = prior
-        self.generator = generator
-
-    @property
-    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
-        """Keys that must be present."""
-        return [self.tensor_keys.scene]
-
-    @abstractmethod
-    def of_scenes(self, noised: NoisedScenes, text: Text | None, flat: TensorDictBase) -> Mapping[str, Tensor]:
-        """Values of ``out_keys``: (B,) with one per scene, or () for a value that is not a mean over scenes."""
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """The loss of a batch of finished scenes."""
-        flat = tensordict.reshape(-1)
-        timestep = flat.get(self.tensor_keys.timestep, None)
-        scene = flat.get(self.tensor_keys.scene).detach()
-        t = None if timestep is None else timestep.reshape(-1)
-        return self.of_noised(self.prior.noised(scene, self.generator, t), flat)
-
-    def of_noised(self, noised: NoisedScenes, flat: TensorDictBase) -> TensorDict:
-        """The loss of a batch of shape [B] whose scenes the prior has noised already."""
-        keys = self.tensor_keys
-        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
-        text = None if tokens is None or mask is None else (tokens.detach(), mask)
-        scene, valid = flat.get(keys.scene), flat.get(keys.valid, None)
-        kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device) if valid is None else valid.reshape(-1)
-        count = kept.sum().clamp(min=1)
-        found = {
-            name: torch.where(kept, value, 0.0).sum() / count if value.ndim else value
-            for name, value in self.of_scenes(noised, text, flat).items()
-        }
-        return TensorDict(found, [])
-
-
-class ForwardProcessLoss(OwnSampleLoss):
+class ForwardProcessLoss(PlainLoss):
     """A loss of finished scenes x_0 at random timesteps of the forward process, weighted by their advantages.
 
     Every scene is noised once per call. o is the output of the trained denoiser, and o_old that of the sampling policy.
@@ -121,7 +44,11 @@ class ForwardProcessLoss(OwnSampleLoss):
     or one per slot. The network denoises every slot given the others, so an advantage per slot credits an object only
     for its own pose.
 
-    Accepted keys (``set_keys``), and those of :class:`~agents.post_training.algorithms.forward_process.OwnSampleLoss`:
+    Accepted keys (``set_keys``):
+        scene: (B, N, D) float, finished scenes x_0 as the prior encodes them. Default ``"scene"``.
+        timestep: (B,) or (B, 1) int64, optional; without it, drawn as in pretraining. Default ``"timestep"``.
+        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
+        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
         advantage: (B,), (B, 1) or (B, N) float, for poses. Default ``"advantage"``.
         category_advantage: advantage for categories, of the same shapes, optional; without it categories have no
             credit. Default ``"category_advantage"``.
@@ -137,13 +64,19 @@ class ForwardProcessLoss(OwnSampleLoss):
     """
 
     @dataclass
-    class _AcceptedKeys(OwnSampleLoss._AcceptedKeys):
+    class _AcceptedKeys:
+        scene: NestedKey = "scene"
+        timestep: NestedKey = "timestep"
+        valid: NestedKey = "valid"
+        text: NestedKey = "text"
+        text_mask: NestedKey = "text_mask"
         advantage: NestedKey = "advantage"
         category_advantage: NestedKey = "category_advantage"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     out_keys = ["loss_objective", "loss_expectation", "distance"]  # noqa: RUF012  (torchrl reads lists)
+    prior: ScenePrior
 
     def __init__(
         self,
@@ -153,7 +86,8 @@ class ForwardProcessLoss(OwnSampleLoss):
         expectation: Expectation | None = None,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__(prior, generator=generator)
+        super().__init__()
+        self.prior, self.generator = prior, generator
         self.expectation = expectation
         self._sampler = (sampler,)  # in a tuple: its parameters are not parameters of the loss
 
@@ -165,7 +99,7 @@ class ForwardProcessLoss(OwnSampleLoss):
     @property
     def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
         """Keys that must be present."""
-        return [*super().in_keys, self.tensor_keys.advantage]
+        return [self.tensor_keys.scene, self.tensor_keys.advantage]
 
     @abstractmethod
     def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
@@ -189,21 +123,26 @@ class ForwardProcessLoss(OwnSampleLoss):
             advantage: (B, 1) or (B, N) advantages.
         """
 
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss of a batch of finished scenes."""
+        flat = tensordict.reshape(-1)
+        timestep = flat.get(self.tensor_keys.timestep, None)
+        scene = flat.get(self.tensor_keys.scene).detach()
+        t = None if timestep is None else timestep.reshape(-1)
+        return self.of_noised(self.prior.noised(scene, self.generator, t), flat)
+
     def of_noised(self, noised: NoisedScenes, flat: TensorDictBase) -> TensorDict:
         """The loss of a batch of shape [B] whose scenes the prior has noised already.
 
         Raises:
             InvalidInputError: an advantage has neither one value per scene nor one per slot.
         """
-        found = super().of_noised(noised, flat)
-        found["distance"] = found["distance"].sqrt()
-        return found
-
-    def of_scenes(self, noised: NoisedScenes, text: Text | None, flat: TensorDictBase) -> Mapping[str, Tensor]:
-        """(B,) losses, (B,) those of the expectation, and (B,) mean squares of o - o_old."""
-        scene = flat.get(self.tensor_keys.scene)
-        advantage = self._advantage(flat, self.tensor_keys.advantage, scene)
-        credit = self._advantage(flat, self.tensor_keys.category_advantage, scene)
+        keys = self.tensor_keys
+        text, scene = self._text(flat), flat.get(keys.scene)
+        advantage = self._advantage(flat, keys.advantage, scene)
+        credit = scene.new_zeros(len(scene), 1)
+        if flat.get(keys.category_advantage, None) is not None:
+            credit = self._advantage(flat, keys.category_advantage, scene)
         output = self.prior.output(noised, text)
         with torch.no_grad():
             old = self.sampler.output(noised, text)
@@ -226,19 +165,13 @@ class ForwardProcessLoss(OwnSampleLoss):
             slots = self.category_loss(output.logits, old.logits, noised.category, credit)
             mean = (slots * noised.drawn).sum(dim=1) / noised.drawn.sum(dim=1).clamp(min=1.0)
             losses = losses + self.prior.config.category_weight * mean
-        return {"loss_objective": losses, "loss_expectation": expectation, "distance": distance}
-
-    def _advantage(self, flat: TensorDictBase, key: NestedKey, scene: Tensor) -> Tensor:
-        """(B, 1) or (B, N); zeros where the key is missing."""
-        found = flat.get(key, None)
-        if found is None:
-            return scene.new_zeros(len(scene), 1)
-        found = found.detach().reshape(len(scene), -1)
-        if found.shape[1] not in (1, scene.shape[1]):
-            raise InvalidInputError(
-                f"{key!r} has {found.shape[1]} values per scene; give one, or one per slot ({scene.shape[1]})"
-            )
-        return found
+        valid = flat.get(keys.valid, None)
+        kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device) if valid is None else valid.reshape(-1)
+        losses, expectation, distance = (
+            torch.where(kept, values, 0.0).sum() / kept.sum().clamp(min=1) for values in (losses, expectation, distance)
+        )
+        found = {"loss_objective": losses, "loss_expectation": expectation, "distance": distance.sqrt()}
+        return TensorDict(found, [])
 
 
 class NFTLoss(ForwardProcessLoss):
@@ -342,38 +275,87 @@ class AWMLoss(ForwardProcessLoss):
         return bounded * _cross_entropy(logits, category) + self.beta * pull
 
 
-def _cross_entropy(logits: Tensor, category: Tensor) -> Tensor:
-    return F.cross_entropy(logits.flatten(0, 1), category.flatten(), reduction="none").view(category.shape)
+class Expectation(nn.Module):
+    """Mean target of a denoiser at a noised scene, over the scenes that the sampling policy makes.
 
-
-def _require_positive(**values: float) -> None:
-    for name, value in values.items():
-        if not value > 0:
-            raise InvalidInputError(f"{name}={value} must be positive")
-
-
-class OwnSampleAlgorithm(AveragedSampler):
-    """Algorithm that trains on the finished scenes of an averaged sampler.
+    A forward-process loss attracts the output to the targets of good samples, repels it from the targets of bad
+    samples, and takes the output of the sampling policy as the mean target. This output is not the mean, because a
+    policy in training is not an exact denoiser of its own samples. Where all samples are bad, the difference repels the
+    output, the sampling policy follows, and the difference grows. This copy of the denoiser learns the mean. Only the
+    covariance of target and advantage is then left, as in a policy gradient with an exact baseline.
 
     Args:
-        policy: policy that is optimised.
-        draws: number of timesteps and noises of every scene per update.
-        sampler_decay: decay, per :meth:`WeightAverage.update`, of the weight average that samples.
+        prior: prior from which the denoiser is copied.
+        learning_rate: learning rate of AdamW.
 
-    Attributes:
-        copy: copy of the denoiser that is trained on the samples with ``loss_expectation``; None for none.
+    >>> from agents.priors.testing import tiny_prior
+    >>> prior = tiny_prior("dimsum_table", process="mixed")
+    >>> noised = prior.noised(prior.encode(prior.sample(2, num_steps=3)))
+    >>> expectation = Expectation(prior)
+    >>> bool((expectation(noised) == prior.output(noised).continuous).all())
+    True
     """
 
-    loss: OwnSampleLoss
-    copy: Expectation | None
+    def __init__(self, prior: ScenePrior, learning_rate: float = 3e-4) -> None:
+        super().__init__()
+        self.prior = deepcopy(prior).requires_grad_(True)
+        self.prior.freeze_text()
+        self.trained = [p for p in self.prior.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.AdamW(self.trained, lr=learning_rate, weight_decay=0.0)
 
-    def __init__(self, policy: DenoisingPolicy, *, draws: int, sampler_decay: float) -> None:
-        super().__init__(policy, sampler_decay=sampler_decay)
-        self.draws = draws
+    def forward(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
+        """(B, N, F) expected targets."""
+        return self.prior.output(noised, text).continuous
 
-    def measure(self, result: TensorDict) -> dict[str, float]:
-        """Figures of a part of the batch, from ``result``, the loss of this part."""
-        return {}
+    def step(self, clip: float = 1.0) -> None:
+        """Apply the gradient that all processes accumulated; one that is not finite is dropped."""
+        ProcessGroup.current().sum_gradients(self.trained)
+        if bool(torch.isfinite(nn.utils.clip_grad_norm_(self.trained, clip))):
+            self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Take the weights of ``prior``, and forget the optimiser's state."""
+        self.prior.load_state_dict(prior.state_dict())
+        self.optimizer.state.clear()
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"weights": self.prior.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        self.prior.load_state_dict(state["weights"])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+
+class ForwardProcess(AveragedSampler):
+    """Algorithm of NFT and AWM, which differ in their loss; see :class:`ForwardProcessLoss`.
+
+    A slower copy of the prior in training, an average of its weights, samples the scenes. This copy is also evaluated
+    and saved.
+
+    Args:
+        settings: settings of the algorithm.
+        policy: policy that is optimised.
+        stds: sigmas of the reverse steps; not used.
+
+    Attributes:
+        expectation: copy of the denoiser that learns the mean of the samples; None for none.
+    """
+
+    loss: ForwardProcessLoss
+
+    def __init__(self, settings: NFTSettings | AWMSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
+        super().__init__(policy, sampler_decay=settings.sampler_decay)
+        self.settings = settings
+        self.advantage = ForwardAdvantage(credit=settings.credit, category_credit=settings.category_credit)
+        rate = settings.expectation_lr
+        self.expectation = Expectation(self.sampler, rate) if rate else None
+        kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
+        self.loss = kind(
+            self.prior, self.sampler, beta=settings.beta, clip=settings.advantage_clip, expectation=self.expectation
+        )
 
     def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """Add the gradient of a batch to ``.grad``: ``draws`` timesteps and noises of every scene.
@@ -385,119 +367,49 @@ class OwnSampleAlgorithm(AveragedSampler):
         size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
         valid = max(1.0, processes.sum_numbers(int(scenes["valid"].sum()))[0])
         everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
-        draws = [self.prior.noised(everything, generator).rows(own) for _ in range(self.draws)]
-        total, sums = 0.0, defaultdict[str, float](float)
-        learned = [] if self.copy is None else self.copy.trained
+        draws = [self.prior.noised(everything, generator).rows(own) for _ in range(self.settings.draws)]
+        total, squares = 0.0, 0.0
+        learned = [] if self.expectation is None else self.expectation.trained
         gradient = GradientSum([*self.prior.parameters(), *learned])
         for start in range(0, len(x0), size):
             rows = slice(start, start + size)
             part = scenes[rows]
-            share = int(part["valid"].sum()) / valid / self.draws
+            share = int(part["valid"].sum()) / valid / self.settings.draws
             for noised in draws:
                 result = self.loss.of_noised(noised.rows(rows), part)
                 objective = result["loss_objective"] * share
                 (objective + result["loss_expectation"] * share).backward()
                 total += float(objective.detach())
-                for name, value in self.measure(result).items():
-                    sums[name] += share * value
+                squares += share * float(result["distance"]) ** 2
             gradient.add_part()
         gradient.write()
-        if self.copy is not None:
-            self.copy.step()
-        total, *means = processes.sum_numbers(total, *sums.values())
-        return BatchGradient(total, dict(zip(sums, means, strict=True)))
-
-
-class ForwardAdvantage(Advantage):
-    """Writes advantages that are not clipped, of poses and of categories.
-
-    Reads, in addition to the keys of :class:`Advantage`:
-        judged: (B, S, N) bool, optional. Slots that the reward does not judge have no advantage of their own: a table
-            of credit 0 would otherwise be repelled like an object that is not feasible.
-        counts_objects: (B, S, 1) bool, optional, whether the reward depends on which objects there are.
-
-    Writes, in addition:
-        category_advantage: (B, S, 1), the scene's advantage, or zeros for no credit.
-
-    Args:
-        credit: ``"scene"``, ``"object"`` or ``"auto"``, for poses.
-        category_credit: ``"scene"``, ``"none"``, or ``"auto"``: none where poses have credit per object and the reward
-            does not count objects.
-    """
-
-    out_keys = ["advantage", "category_advantage", "valid"]  # noqa: RUF012
-
-    def __init__(self, *, credit: str = "auto", category_credit: str = "auto") -> None:
-        super().__init__(credit=credit, clip=math.inf)
-        self.category_credit = category_credit
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``out_keys``."""
-        final = super().forward(tensordict)[:, -1]
-        per_object = self.credited(final)[0].ndim == 2
-        poses_alone = per_object and not bool(final.get("counts_objects", torch.zeros(1)).any())
-        if self.category_credit == "none" or (self.category_credit == "auto" and poses_alone):
-            categories = torch.zeros_like(final["advantage"][:, 0])
-        else:
-            categories = compute_advantages(*final_reward(final), clip=math.inf, groups=prompt_groups(final))
-        return tensordict.set("category_advantage", at_all_steps(categories, tensordict))
-
-    def credited(self, final: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Rewards of slots that are judged, or of scenes."""
-        reward, valid = super().credited(final)
-        judged = final.get("judged", None)
-        return reward, valid if reward.ndim == 1 or judged is None else valid & judged
-
-
-class ForwardProcess(OwnSampleAlgorithm):
-    """Algorithm of NFT and AWM, which differ in their loss; see :class:`ForwardProcessLoss`.
-
-    A slower copy of the prior in training, an average of its weights, samples the scenes. This copy is also evaluated
-    and saved.
-
-    Args:
-        settings: settings of the algorithm.
-        policy: policy that is optimised.
-        stds: sigmas of the reverse steps; not used.
-    """
-
-    loss: ForwardProcessLoss
-
-    def __init__(self, settings: NFTSettings | AWMSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
-        super().__init__(policy, draws=settings.draws, sampler_decay=settings.sampler_decay)
-        self.settings = settings
-        self.advantage = ForwardAdvantage(credit=settings.credit, category_credit=settings.category_credit)
-        rate = settings.expectation_lr
-        self.copy = Expectation(self.sampler, rate) if rate else None
-        self.loss = self.make_loss()
-
-    def make_loss(self) -> ForwardProcessLoss:
-        """The loss that the settings name."""
-        settings = self.settings
-        kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
-        return kind(self.prior, self.sampler, beta=settings.beta, clip=settings.advantage_clip, expectation=self.copy)
-
-    def measure(self, result: TensorDict) -> dict[str, float]:
-        """Mean square of the trained denoiser's output minus the sampling policy's."""
-        return {"distance": float(result["distance"]) ** 2}
-
-    def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
-        """See :class:`OwnSampleAlgorithm`; ``distance`` is a root mean square."""
-        gradient = super().accumulate(batch, generator)
-        return replace(gradient, columns={**gradient.columns, "distance": gradient.columns["distance"] ** 0.5})
+        if self.expectation is not None:
+            self.expectation.step()
+        total, squares = processes.sum_numbers(total, squares)
+        return BatchGradient(total, {"distance": squares**0.5})
 
     def return_to(self, prior: ScenePrior) -> None:
         """Sample with the weights of ``prior``; the expectation begins with them as well."""
         super().return_to(prior)
-        if self.copy is not None:
-            self.copy.return_to(prior)
+        if self.expectation is not None:
+            self.expectation.return_to(prior)
 
     def state(self) -> dict[str, Any]:
         """The state of the sampling policy, and that of the expectation."""
-        return {**super().state(), "expectation": None if self.copy is None else self.copy.state()}
+        return {**super().state(), "expectation": None if self.expectation is None else self.expectation.state()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
         super().restore(state)
-        if self.copy is not None:
-            self.copy.restore(state["expectation"])
+        if self.expectation is not None:
+            self.expectation.restore(state["expectation"])
+
+
+def _cross_entropy(logits: Tensor, category: Tensor) -> Tensor:
+    return F.cross_entropy(logits.flatten(0, 1), category.flatten(), reduction="none").view(category.shape)
+
+
+def _require_positive(**values: float) -> None:
+    for name, value in values.items():
+        if not value > 0:
+            raise InvalidInputError(f"{name}={value} must be positive")

@@ -81,8 +81,6 @@ class GuidanceDistillationLoss(PlainLoss):
         keys, flat = self.tensor_keys, tensordict.reshape(-1)
         x, t = flat.get(keys.scene).detach(), flat.get(keys.timestep).reshape(-1)
         teacher, trained = flat.get(keys.denoised).detach(), flat.get(keys.trained, None)
-        tokens, mask = flat.get(keys.text, None), flat.get(keys.text_mask, None)
-        text = None if tokens is None or mask is None else (tokens.detach(), mask)
         weight = self.prior.loss_weight(x.shape[1]).to(x)[:, :POSE_FEATURES].expand(len(x), -1, -1)
         weight = weight if trained is None else weight * trained[..., None]
         noised = NoisedScenes(
@@ -90,7 +88,7 @@ class GuidanceDistillationLoss(PlainLoss):
             category=x[..., POSE_FEATURES:].argmax(dim=-1),
             observed=self.prior.observed_entries(x),
         )  # fmt: skip
-        found = self.prior.denoised(noised, self.prior.output(noised, text))[..., :POSE_FEATURES]
+        found = self.prior.denoised(noised, self.prior.output(noised, self._text(flat)))[..., :POSE_FEATURES]
         entries = ((found - teacher) / self._std(t, x)).square() * weight
         losses = entries.sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
         return TensorDict({"loss_objective": losses.mean()}, [])
