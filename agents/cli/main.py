@@ -21,10 +21,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import torch
-
 from agents.cli.commands import COMMANDS, load_command
-from agents.cli.keys import Sources, compose, format_rows, help_text, keys_of
+from agents.cli.keys import compose, format_rows, help_text, keys_of
 from agents.configuration.composition import (
     PROGRESS_STYLES,
     config_text,
@@ -182,18 +180,18 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
     shown, sweep, asked = _option(words, "--cfg", "-c"), _flag(words, "--multirun", "-m"), _flag(words, "-h", "--help")
     if shown not in ("", "job"):
         raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
-    command, sources = program.removeprefix("scene-envs "), Sources(config_dir, file)
+    command = program.removeprefix("scene-envs ")
     named = _named(words, getattr(module, "POSITIONAL", ()))
     keys = keys_of(module)
     if asked:
-        config = keys if sweep or not named else compose(command, keys, named, sources)
+        config = keys if sweep or not named else compose(command, keys, named, config_dir, file)
         print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
         return DONE
     if not sweep:
-        settings = compose(command, keys, named, sources)
+        settings = compose(command, keys, named, config_dir, file)
         _check(settings, allow_local, bool(shown), module)
         return _run(command, module, settings, bool(shown))
-    runs = [(compose(command, keys, variant, sources), label) for variant, label in expand_sweeps(named)]
+    runs = [(compose(command, keys, variant, config_dir, file), label) for variant, label in expand_sweeps(named)]
     for settings, _ in runs:
         _check(settings, allow_local, bool(shown), module)
     return _run_all(command, module, runs, bool(shown))
@@ -485,12 +483,13 @@ def check_device(name: str) -> None:
 
     >>> check_device("cpu")
     """
+    import torch
+
     try:
         device = torch.device(name)
         torch.empty(1, device=device)
     except Exception:  # each backend has errors of its own
-        here = ["cpu"]
-        here += [f"cuda:{index}" for index in range(torch.cuda.device_count())]
+        here = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
         raise InvalidInputError(
             f"device={str(name)[:60]!r} is not a torch device of this machine; use one of {', '.join(here)}"
         ) from None

@@ -13,7 +13,6 @@ from types import TracebackType
 from typing import Any
 
 from agents.configuration.composition import config_text, dotted
-from agents.utils.process_group import is_first_process, launched_processes
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import claimed, read_sealed, sealed, storage_error, write_json, write_text
 
@@ -80,6 +79,8 @@ class Run:
     """
 
     def __init__(self, command: str, settings: Any) -> None:
+        from agents.utils.process_group import is_first_process
+
         self.command = command
         self.settings = settings
         self.directory = Path(settings.output)
@@ -249,6 +250,8 @@ def fresh_directory(command: str) -> str:
     Raises:
         InvalidInputError: this is one of several processes, which need the same folder.
     """
+    from agents.utils.process_group import launched_processes
+
     if (count := launched_processes()) > 1:
         raise InvalidInputError(
             f"the {count} processes of this run share a folder; give output=, such as runs/{command}"

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.cli.run_folder import Run
 from agents.configuration.composition import MEASURE_NAMES, OutputKeys
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, unknown_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from agents.cli.run_folder import Run
     from agents.priors.prior import ScenePrior
     from scene_envs.scene import SceneBatch
 

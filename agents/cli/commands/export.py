@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import make_ready
+from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from agents.cli.run_folder import Run
 from agents.configuration.composition import DeviceKeys, named
 from scene_envs.errors import InvalidInputError
-
-if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
 
 POSITIONAL = ("checkpoint", "metadata")
 """Words without ``=`` fill these keys, in this order."""

@@ -9,12 +9,12 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import draw_scenes
+from agents.cli.run_folder import Run
 from agents.configuration.composition import DeviceKeys
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
 
 if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
     from agents.priors.prior import ScenePrior
     from scene_envs.scene import SceneBatch
 

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from agents.cli.commands.scenes import draw_scenes, make_ready
+from agents.cli.run_folder import Run
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import load_scenes
-
-if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
 
 
 @dataclass

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.export import export_scenes
 from agents.cli.commands.scenes import draw_scenes, make_ready, reward_figures
+from agents.cli.run_folder import Run
 from agents.configuration.composition import OutputKeys, SamplingKeys, named, require_one_of
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
     from scene_envs.scene_types import SceneType
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from agents.cli.run_folder import Run
+
 if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.cli.run_folder import Run
 from agents.configuration.composition import DeviceKeys, ProgressKeys, RewardLimits, composed, named
 from agents.planning.settings import SearchConfig
 from scene_envs.scene_sources import load_scenes
@@ -15,7 +16,6 @@ from scene_envs.scene_sources import load_scenes
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from agents.cli.run_folder import Run
     from scene_envs.progress import Progress
 
 FRESH_PRIOR = "dimsum_table"

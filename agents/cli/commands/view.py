@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys, named
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene_sources import find_scenes, is_dataset, load_scenes
 
 if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
     from scene_envs.scene import SceneBatch
 
 
