@@ -603,22 +603,31 @@ class ProgressKeys:
 
 
 @dataclass
-class SamplingKeys:
-    """Sampling of scenes.
+class PromptKeys:
+    """Prompt of the scenes.
 
     Attributes:
         prompt: text that the scenes should match, for priors that read prompts; null for no prompt.
         guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         claim_guidance: strength with which scenes are guided to the numbers and places that the prompt gives, 0 for
             none; 2 is a good choice; needs a prompt.
-        num_steps: denoising steps per scene.
-        slots: slots per scene, which may exceed the number in training; null takes the number in training.
-        seed: seed of the noise.
     """
 
     prompt: str | None = None
     guidance: float = 0.0
     claim_guidance: float = 0.0
+
+
+@dataclass
+class SamplingKeys(PromptKeys):
+    """Sampling of scenes.
+
+    Attributes:
+        num_steps: denoising steps per scene.
+        slots: slots per scene, which may exceed the number in training; null takes the number in training.
+        seed: seed of the noise.
+    """
+
     num_steps: int = 50
     slots: int | None = None
     seed: int = 0
@@ -626,17 +635,18 @@ class SamplingKeys:
 
 @dataclass
 class DrawKeys(DeviceKeys):
-    """Sampling from a prior, with prior=.
+    """Samples of a prior.
 
     Attributes:
-        num_steps: denoising steps per scene, with prior=.
+        num_steps: denoising steps per scene.
         physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps, 0
-            to 1, with prior=; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0 for
-            the others.
+            to 1; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0 for the others.
+        seed: seed of the noise.
     """
 
     num_steps: int = 50
     physics_guidance: float | None = None
+    seed: int = 0
 
 
 @dataclass
