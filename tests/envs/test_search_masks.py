@@ -12,7 +12,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env, data_equivalence
 
-from agents.planning import BeamPlanner, BestOfPlanner, GreedyPlanner, Journal, MCTSPlanner, Session, UCTPlanner
+from agents.planning import BeamPlanner, BestOfPlanner, GreedyPlanner, Journal, MCTSPlanner, Session
 from scene_envs import check_branchable
 from scene_envs.envs import SearchEnv, SearchMaskEnv
 from scene_envs.errors import InvalidInputError, UnknownNameError
@@ -134,7 +134,7 @@ def test_states_survive_pickling_and_restoring(env: SearchMaskEnv, kwargs: dict[
         env.restore_state(plain.state)
 
 
-@pytest.mark.parametrize("planner", [BeamPlanner, BestOfPlanner, GreedyPlanner, MCTSPlanner, UCTPlanner])
+@pytest.mark.parametrize("planner", [BeamPlanner, BestOfPlanner, GreedyPlanner, MCTSPlanner])
 def test_planners_search_it(env: SearchMaskEnv, planner: type, tmp_path: Any) -> None:
     root = env.clone_state()
     plan = planner().make(3)
