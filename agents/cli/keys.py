@@ -20,7 +20,7 @@ from agents.configuration.composition import (
     by_hydra,
     check_option,
     dotted,
-    dotted_keys,
+    dotted_values,
     field_options,
     group_options,
     merged,
@@ -214,7 +214,7 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
             check_option(folder := key.removeprefix("+"), value, group_options(folder, config_dir))
             choices[key] = value
         elif head not in fields:
-            raise unknown_name(f"{command} key", key, dotted_keys(config()))
+            raise unknown_name(f"{command} key", key, dotted_values(config()))
         elif _is_option(fields[head], key, value, config_dir):
             choices[key] = value
             values.pop(key, None)

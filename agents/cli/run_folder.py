@@ -90,7 +90,6 @@ class Run:
         self._claim = ExitStack()
 
     def __enter__(self) -> Run:
-        self._claim = ExitStack()
         if not self._is_first:
             self._make_folder()
             return self
@@ -104,7 +103,7 @@ class Run:
             self.log(f"scene-envs {self.command}")
         except BaseException as error:
             self._claim.close()
-            if isinstance(error, OSError) and not isinstance(error, InvalidInputError):
+            if isinstance(error, OSError):
                 raise storage_error(self.directory, error) from error
             raise
         return self
@@ -128,9 +127,8 @@ class Run:
         if writer is None and _RESUMES.get(self.command) in found:
             return True
         if writer != self.command:
-            raise InvalidInputError(
-                f"output={str(self.directory)!r} holds {found[0]} of {_named(writer)}; give another output"
-            )
+            other = "another program" if writer is None else f"scene-envs {writer}"
+            raise InvalidInputError(f"output={str(self.directory)!r} holds {found[0]} of {other}; give another output")
         if self.command not in _OWN_RULE and not getattr(self.settings, "compares_keys", False):
             self._check_keys()
         return True
@@ -147,8 +145,7 @@ class Run:
             raise _unreadable(path, " ".join(str(error).split())) from error
         if not isinstance(before, dict):
             raise _unreadable(path, f"{str(path)!r} holds no keys")
-        now = yaml.safe_load(config_text(self.settings))
-        was, is_now = dotted(before), dotted(now)
+        was, is_now = dotted(before), dotted(yaml.safe_load(config_text(self.settings)))
         changed = [
             f"{key} was {was[key]!r}, is {is_now[key]!r}"
             for key in is_now
@@ -234,10 +231,6 @@ def _writer(folder: Path) -> str | None:
             if found := re.match(r"[-0-9]+ [:0-9]+ scene-envs ([-\w]+)$", line):
                 return found[1]
     return None
-
-
-def _named(writer: str | None) -> str:
-    return "another program" if writer is None else f"scene-envs {writer}"
 
 
 def _empty_files(folder: Path) -> set[Path]:

@@ -200,7 +200,7 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
     for key, value in changes.items():
         head, dot, rest = key.partition(".")
         if head not in known:
-            raise unknown_name("key", key, dotted_keys(config))
+            raise unknown_name("key", key, dotted_values(config))
         if dot:
             groups.setdefault(head, {})[rest] = value
         else:
@@ -209,18 +209,13 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
     return dataclasses.replace(config, **{**values, **nested})  # type: ignore[type-var]
 
 
-def dotted_keys(config: Any) -> list[str]:
-    """All keys of a config; a key of a group stands behind the name of the group and a dot."""
-    return list(dotted_values(config))
-
-
 def dotted_values(config: Any) -> dict[str, Any]:
-    """All values of a config by :func:`dotted_keys`."""
+    """All values of a config; a key of a group stands behind the name of the group and a dot."""
     values: dict[str, Any] = {}
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
+    for name in config.__dataclass_fields__:
+        value = getattr(config, name)
         inner = dotted_values(value) if dataclasses.is_dataclass(value) else None
-        values |= {field.name: value} if inner is None else {f"{field.name}.{key}": item for key, item in inner.items()}
+        values |= {name: value} if inner is None else {f"{name}.{key}": item for key, item in inner.items()}
     return values
 
 

@@ -44,21 +44,12 @@ class InpaintingConfig(PromptKeys, DrawKeys):
     pictures: int = 12
     output: str = ""
 
-    def sampling(self, first: int = 0) -> dict[str, Any]:
-        """Arguments of the methods of priors that these keys give, for scenes from number ``first`` on."""
-        return {
-            "prompt": self.prompt,
-            "guidance": self.guidance,
-            "claim_guidance": self.claim_guidance,
-            "physics_guidance": self.physics_guidance,
-            "num_steps": self.num_steps,
-            "seed": self.seed + first,
-        }
-
-    def in_parts(self, batch: SceneBatch, change: Callable[[SceneBatch, dict[str, Any]], SceneBatch]) -> SceneBatch:
-        """The scenes as ``change`` makes them from a part and its arguments; parts bound the memory."""
+    def in_parts(self, batch: SceneBatch, change: Callable[..., SceneBatch], **keys: Any) -> SceneBatch:
+        """The scenes as ``change`` makes them from a part and the keys of sampling; parts bound the memory."""
+        names = ("prompt", "guidance", "claim_guidance", "physics_guidance", "num_steps")
+        keys |= {name: getattr(self, name) for name in names}
         starts = range(0, len(batch), _AT_ONCE)
-        parts = [change(batch[start : start + _AT_ONCE], self.sampling(start)).to("cpu") for start in starts]
+        parts = [change(batch[first : first + _AT_ONCE], seed=self.seed + first, **keys).to("cpu") for first in starts]
         return parts[0].concatenate(parts)
 
 
@@ -111,9 +102,7 @@ class CompleteConfig(InpaintingConfig):
 def run_complete(settings: CompleteConfig, run: Run) -> None:
     """Fill the empty slots."""
     prior, batch = load_prior_and_scenes("complete", settings)
-    filled = settings.in_parts(
-        batch, lambda part, keys: prior.complete(part, slots=settings.slots, fill=settings.fill, **keys)
-    )
+    filled = settings.in_parts(batch, prior.complete, slots=settings.slots, fill=settings.fill)
     added = float((filled.counts - batch.counts).double().mean())
     run.say(f"{len(batch)} scenes, {added:.1f} objects added on average")
     save_scenes(batch, filled, settings.pictures, run, {"added": added})
@@ -122,7 +111,7 @@ def run_complete(settings: CompleteConfig, run: Run) -> None:
 def run_rearrange(settings: InpaintingConfig, run: Run) -> None:
     """Give the free objects new poses; welded objects stay."""
     prior, batch = load_prior_and_scenes("rearrange", settings)
-    moved = settings.in_parts(batch, lambda part, keys: prior.rearrange(part, **keys))
+    moved = settings.in_parts(batch, prior.rearrange)
     distance = (moved.translations - batch.translations).norm(dim=-1)[batch.is_free]
     figures = {"mean_distance_m": float(distance.double().mean()) if len(distance) else 0.0}
     run.say(f"{len(batch)} scenes, objects moved by {figures['mean_distance_m']:.3f} m on average")
