@@ -212,7 +212,7 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
 def dotted_values(config: Any) -> dict[str, Any]:
     """All values of a config; a key of a group stands behind the name of the group and a dot."""
     values: dict[str, Any] = {}
-    for name in config.__dataclass_fields__:
+    for name in [field.name for field in dataclasses.fields(config)]:
         value = getattr(config, name)
         inner = dotted_values(value) if dataclasses.is_dataclass(value) else None
         values |= {name: value} if inner is None else {f"{name}.{key}": item for key, item in inner.items()}
