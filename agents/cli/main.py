@@ -45,7 +45,7 @@ from scene_envs.errors import (
     UnknownNameError,
     unknown_name,
 )
-from scene_envs.files import exists, is_file
+from scene_envs.files import exists
 from scene_envs.scene_sources import find_scenes
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
@@ -192,15 +192,20 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
         config = keys if sweep or not named else compose(command, keys, named, config_dir, file)
         print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
         return DONE
-    if not sweep:
-        settings = compose(command, keys, named, config_dir, file)
-        if not shown:
-            _check(settings, module, allow_local)
-        return _run(command, module, settings, bool(shown))
-    runs = [(compose(command, keys, variant, config_dir, file), label) for variant, label in expand_sweeps(named)]
+    if sweep and not getattr(module, "WRITES", True):
+        raise InvalidInputError(f"--multirun: {command} writes no folder; run it once for each value")
+    variants = expand_sweeps(named) if sweep else [(named, "")]
+    runs = [(compose(command, keys, variant, config_dir, file), label) for variant, label in variants]
     for settings, _ in runs if not shown else ():
         _check(settings, module, allow_local)
-    return _run_all(command, module, runs, bool(shown))
+    folder = ""
+    for settings, label in runs:
+        if sweep:  # each run has a folder of its own below ``output``
+            folder = settings.output or folder or fresh_directory(command)
+            settings = replace(settings, output=str(Path(folder) / label))
+            print(f"{'# ' * bool(shown)}{command} {label}", flush=True)
+        _run(command, module, settings, bool(shown))
+    return DONE
 
 
 def _ask_for_files(key: str, reward: Any, allow_local: bool) -> None:
@@ -218,31 +223,15 @@ def _ask_for_files(key: str, reward: Any, allow_local: bool) -> None:
         allow_local_rewards(path)
 
 
-def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> int:
+def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> None:
     if only_show:
         print(config_text(settings), end="")
-        return DONE
-    if not getattr(module, "WRITES", True):
+    elif not getattr(module, "WRITES", True):
         module.run(settings)
-        return DONE
-    if not settings.output:
-        settings = replace(settings, output=fresh_directory(command))
-    with Run(command, settings) as run:
-        module.run(settings, run)
-    return DONE
-
-
-def _run_all(command: str, module: ModuleType, runs: Sequence[tuple[Any, str]], only_show: bool) -> int:
-    """One run after the other, each in a folder of its own below ``output``; the first that fails ends them."""
-    if not getattr(module, "WRITES", True):
-        raise InvalidInputError(f"--multirun: {command} writes no folder; run it once for each value")
-    folder = ""
-    for settings, label in runs:
-        folder = settings.output or folder or fresh_directory(command)
-        own = replace(settings, output=str(Path(folder) / label))
-        print(f"{'# ' * only_show}{command} {label}", flush=True)
-        _run(command, module, own, only_show)
-    return DONE
+    else:
+        settings = settings if settings.output else replace(settings, output=fresh_directory(command))
+        with Run(command, settings) as run:
+            module.run(settings, run)
 
 
 def _option(words: list[str], *names: str) -> str:
@@ -381,13 +370,6 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
         check_device(device)
 
 
-def check_files(*paths: str) -> None:
-    """Refuse paths at which there is no file."""
-    for path in paths:
-        if not is_file(Path(path)):
-            raise InvalidInputError(f"{path[:200]!r} is no file; name one that is there")
-
-
 def _check_numbers(settings: Any) -> None:
     workers = getattr(settings, "workers", 0)
     if isinstance(workers, int) and workers < 0:
@@ -426,6 +408,8 @@ def _check_dataset(key: str, value: Any) -> None:
 
 
 def _check_guidance(settings: Any) -> None:
+    from scene_envs.envs.settings import check_claim_guidance, check_physics_guidance
+
     prompt, guidance = getattr(settings, "prompt", None), getattr(settings, "guidance", 0.0)
     if not math.isfinite(guidance):
         raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
@@ -434,12 +418,8 @@ def _check_guidance(settings: Any) -> None:
 
         check_prompt(prompt, guidance)
     if strength := getattr(settings, "claim_guidance", 0.0):
-        from scene_envs.envs.settings import check_claim_guidance
-
         check_claim_guidance(prompt if hasattr(settings, "prompt") else "those of real scenes", strength)
     if strength := getattr(settings, "physics_guidance", 0.0):
-        from scene_envs.envs.settings import check_physics_guidance
-
         check_physics_guidance(strength)
 
 

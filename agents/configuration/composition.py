@@ -143,16 +143,10 @@ def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, com
             raise InvalidInputError(
                 f"{path}={as_command_line_text(value)}: {path} is a group of keys; give one of {keys}"
             )
-        return build(kind_of(field, hint, value), value, f"{path}.", command)
+        if find := field.metadata.get("kinds"):  # the name of a component decides which settings it has
+            hint = find(value["name"] if "name" in value else default_of(field).name)
+        return build(hint, value, f"{path}.", command)
     return _scalar(hint, value, path)
-
-
-def kind_of(field: dataclasses.Field[Any], hint: type, value: Mapping[str, Any]) -> type:
-    """The dataclass of a group's settings, which its ``name`` decides where components are registered."""
-    find: Callable[[str], type] | None = field.metadata.get("kinds")
-    if find is None:
-        return hint
-    return find(value["name"] if "name" in value else default_of(field).name)
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:
@@ -494,21 +488,21 @@ def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str =
     from hydra.core.config_store import ConfigStore
     from omegaconf import OmegaConf
 
-    groups = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("folder")}
-    keys = {name: field.metadata["folder"] for name, field in groups.items()}
-    paths = {name: folder if folder == name else f"{folder}@{name}" for name, folder in keys.items()}
-    store = ConfigStore.instance()
-    for name, folder in keys.items():
-        found = groups[name].metadata["registered"]()
+    store, paths = ConfigStore.instance(), {}
+    for field in dataclasses.fields(kind):
+        if not (folder := field.metadata.get("folder")):
+            continue
+        paths[field.name] = folder if folder == field.name else f"{folder}@{field.name}"
+        found = field.metadata["registered"]()
         nodes = found if isinstance(found, Mapping) else {option: {"name": option} for option in found}
         store.repo.pop(folder, None)
         for option in nodes.keys() - set(group_options(folder, config_dir)):  # a file takes the place of a node
             store.store(group=folder, name=option, node=dict(nodes[option]))
-    defaults: list[Any] = ["_self_", *({path: None} for path in paths.values())]
-    defaults += [{"recipe": None}] if any(field.name == "recipe" for field in dataclasses.fields(kind)) else []
-    store.store(name="primary", node={"defaults": defaults})
+    recipe = ["recipe"] if "recipe" in kind.__dataclass_fields__ else []
+    defaults = ["_self_", *({path: None} for path in [*paths.values(), *recipe])]
+    places = [f"file://{Path(config_dir).resolve()}"] if config_dir else []
+    store.store(name="primary", node={"defaults": defaults, "hydra": {"searchpath": places}})
     words = [f"{paths.get(key, key)}={option}" for key, option in choices]
-    words += [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
     with initialize_config_module("configs", version_base="1.3"):
         made = OmegaConf.to_container(compose("primary", overrides=words), resolve=False)
     assert isinstance(made, dict)

@@ -201,11 +201,12 @@ def test_values_that_cannot_be_read_are_named(word: str, message: str) -> None:
 
 def test_an_experiment_reads_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ITERATIONS", "7")
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment" / "env.yaml").write_text(
+    folder = tmp_path / "a, [b] c=1"  # words of Hydra's grammar
+    (folder / "experiment").mkdir(parents=True)
+    (folder / "experiment" / "env.yaml").write_text(
         "# @package _global_\ndefaults: [{override /algorithm: nft}]\niterations: ${oc.env:ITERATIONS}\n"
     )
-    found = compose("post-train", PostTrainConfig, ["+experiment=env"], config_dir=str(tmp_path))
+    found = compose("post-train", PostTrainConfig, ["+experiment=env"], config_dir=str(folder))
     assert (found.iterations, found.algorithm.name) == (7, "nft")
 
 

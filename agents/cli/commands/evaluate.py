@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.cli.commands.scenes import draw, draw_scenes, load_prior
+from agents.cli.commands.scenes import check_files, draw, draw_scenes, load_prior
 from agents.cli.run_folder import Run
 from agents.configuration.composition import MEASURE_NAMES, DrawKeys, OutputKeys
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, unknown_name
@@ -122,8 +122,6 @@ def check(settings: EvaluateConfig) -> None:
             "are of; null takes all of them"
         )
     if settings.fid_weights and "fid" in groups:
-        from agents.cli.main import check_files
-
         check_files(settings.fid_weights)
 
 

@@ -1,11 +1,14 @@
-"""Functions on scenes that several commands share: scoring, making ready, drawing."""
+"""Functions that several commands share: sampling, scoring, making ready, drawing."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
+from scene_envs.errors import InvalidInputError
+from scene_envs.files import is_file
 
 if TYPE_CHECKING:
     from agents.priors.prior import ScenePrior
@@ -13,6 +16,13 @@ if TYPE_CHECKING:
     from scene_envs.scene import SceneBatch
 
 _TILE = (400, 300)
+
+
+def check_files(*paths: str) -> None:
+    """Refuse paths at which there is no file."""
+    for path in paths:
+        if not is_file(Path(path)):
+            raise InvalidInputError(f"{path[:200]!r} is no file; name one that is there")
 
 
 def load_prior(settings: Any) -> ScenePrior:
