@@ -309,7 +309,7 @@ def _with(made: Mapping[str, Any], key: str, value: Any, config: type, tree: Map
     head, *inner = key.split(".")
     if not inner and not dataclasses.is_dataclass(_hint(config, head)):
         return {**made, key: value}
-    field = config.__dataclass_fields__[head]
+    (field,) = (field for field in dataclasses.fields(config) if field.name == head)
     if field.metadata.get("named") and not isinstance(made.get(head), Mapping):
         before = made.get(head, tree.get(head, field.default))
         made = {**made, head: before if isinstance(before, Mapping) else {"name": before}}

@@ -95,9 +95,8 @@ class Run:
             return self
         self._claim.enter_context(claimed(self.directory, f"scene-envs {self.command}"))
         try:
-            self._is_repeated = self._check_folder()
             self._before = _empty_files(self.directory)
-            if not self._is_repeated:
+            if not self._holds_results():
                 self.write_config()
             self._start_logging()
             self.log(f"scene-envs {self.command}")
@@ -114,13 +113,11 @@ class Run:
         except (FileExistsError, NotADirectoryError):
             raise InvalidInputError(f"output={str(self.directory)!r} is a file, not a folder; give another") from None
 
-    def _check_folder(self) -> bool:
+    def _holds_results(self) -> bool:
         """Whether the folder holds results of this command; refuses those of another, or of other keys."""
         found = [name for name in _RESULTS if (self.directory / name).exists()]
         writer = _writer(self.directory)
-        if not found and writer == self.command:
-            return False
-        if writer is not None:
+        if writer is not None and (found or writer != self.command):
             found += [name for name in _PARTS if (self.directory / name).exists()]
         if not found:
             return False

@@ -498,7 +498,7 @@ def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str =
         store.repo.pop(folder, None)
         for option in nodes.keys() - set(group_options(folder, config_dir)):  # a file takes the place of a node
             store.store(group=folder, name=option, node=dict(nodes[option]))
-    recipe = ["recipe"] if "recipe" in kind.__dataclass_fields__ else []
+    recipe = ["recipe" for field in dataclasses.fields(kind) if field.name == "recipe"]
     defaults = ["_self_", *({path: None} for path in [*paths.values(), *recipe])]
     places = [f"file://{Path(config_dir).resolve()}"] if config_dir else []
     store.store(name="primary", node={"defaults": defaults, "hydra": {"searchpath": places}})

@@ -113,7 +113,7 @@ def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> l
 
 def check(settings: EvaluateConfig) -> None:
     """Refuse impossible settings before the prior is read."""
-    groups = choose_measures(settings.measures, project=settings.project)
+    choose_measures(settings.measures, project=settings.project)
     if settings.heldout and not settings.data:
         raise InvalidInputError("heldout= needs data=, the dataset that the prior was trained on")
     if settings.prompt_count is not None and not 2 <= settings.prompt_count <= settings.count:
@@ -121,7 +121,7 @@ def check(settings: EvaluateConfig) -> None:
             f"prompt_count={settings.prompt_count} must be from 2 to count={settings.count}, whose scenes the prompts "
             "are of; null takes all of them"
         )
-    if settings.fid_weights and "fid" in groups:
+    if settings.fid_weights:
         check_files(settings.fid_weights)
 
 
@@ -285,16 +285,8 @@ def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
     keys = {key: value for key, value in vars(settings).items() if key not in _NOT_PART}
     keys["physics_guidance"] = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
     if settings.fid_weights:
-        keys["fid_weights"] = _file_digest(Path(settings.fid_weights))
+        keys["fid_weights"] = hashlib.sha256(Path(settings.fid_weights).read_bytes()).hexdigest()[:16]
     return {**keys, "digest": prior_digest(prior)}
-
-
-def _file_digest(path: Path) -> str:
-    """Digest of a file, 16 characters; empty for one that cannot be read."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-    except OSError:
-        return ""
 
 
 def _prompted(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str]) -> SceneBatch:
