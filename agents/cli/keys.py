@@ -20,7 +20,7 @@ from agents.configuration.composition import (
     by_hydra,
     check_option,
     dotted,
-    dotted_keys,
+    dotted_values,
     field_options,
     group_options,
     merged,
@@ -59,10 +59,6 @@ _OPENING = "[{('\""
 """First characters of values that are no list without brackets."""
 
 
-ADAPTER = "adapter"
-"""The key that every command with ``prior=`` has besides its own."""
-
-
 @dataclass(frozen=True)
 class KeyHelp:
     """One key of a command.
@@ -79,7 +75,7 @@ class KeyHelp:
 
 
 _ADAPTER = KeyHelp(
-    ADAPTER,
+    "adapter",
     "",
     "updates of the prior: a prior that was trained from it, or the folder of such a run; A+0.5*B adds two.",
 )
@@ -97,43 +93,7 @@ def describe_fields(config: type | Any) -> list[KeyHelp]:
 
     Meanings stand under ``Attributes:`` in the docstrings.
     """
-    made = config() if isinstance(config, type) else config
-    keys = [key for part in _parts(made).values() for key in part]
-    return keys + [key for field, value in _groups(made) for key in _keys(value, f"{field.name}.")]
-
-
-def _groups(made: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
-    """The fields that are groups of keys, and their values."""
-    values = [(field, getattr(made, field.name)) for field in dataclasses.fields(made)]
-    return [(field, value) for field, value in values if dataclasses.is_dataclass(value)]
-
-
-def _keys(made: Any, prefix: str = "", fields: Sequence[dataclasses.Field[Any]] | None = None) -> list[KeyHelp]:
-    """The keys among ``fields``, by default among all fields.
-
-    A group inside a group is one key, whose value is a mapping. The name of a component is no key of its own, as
-    ``algorithm=NAME`` gives it.
-    """
-    meanings, keys = attribute_meanings(type(made)), []
-    for field in dataclasses.fields(made) if fields is None else fields:
-        value, meaning = getattr(made, field.name), meanings.get(field.name, "")
-        if dataclasses.is_dataclass(value) and prefix:
-            inner = attribute_meanings(type(value))
-            meaning = " ".join([f"a mapping: {meaning}", *(f"{name}: {text}" for name, text in inner.items())])
-        elif dataclasses.is_dataclass(value) or (prefix and field.name == "name"):
-            continue
-        keys.append(KeyHelp(prefix + field.name, as_command_line_text(value), meaning))
-    return keys
-
-
-def _parts(made: Any) -> dict[type, list[KeyHelp]]:
-    """The keys of a command that are no groups, by the class that declares them, in the order of a listing."""
-    parts = {part: sorted(_keys(made, fields=own), key=_place) for part, own in parts_of(type(made)).items()}
-    return dict(sorted(((part, keys) for part, keys in parts.items() if keys), key=lambda item: _place(item[1][0])))
-
-
-def _place(key: KeyHelp) -> int:
-    return _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST)
+    return [key for _, keys in _sections(config) for key in keys]
 
 
 def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "") -> str:
@@ -145,22 +105,52 @@ def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "
         config_dir: a folder with further options.
     """
     chosen = dict(word.partition("=")[::2] for word in words)
+    sections = _sections(config)
+    has_parts = sum(isinstance(owner, type) for owner, _ in sections) > 1
+    paragraphs = []
+    for owner, keys in sections:
+        if not isinstance(owner, type):
+            heading = _heading(owner, chosen.get(owner.name, ""), config_dir)
+        else:
+            heading = inspect.cleandoc(owner.__doc__ or "").partition("\n")[0].rstrip(".") + ":" if has_parts else ""
+            after = next((place for place, key in enumerate(keys, 1) if key.name == "prior"), 0)
+            keys[after:after] = [_ADAPTER] if after else []
+        rows = format_rows([(f"{key.name}={key.default}", key.meaning) for key in keys])
+        paragraphs.append(f"{heading}\n{rows}" if heading else rows)
+    return "\n\n".join(paragraphs) or "  no keys"
+
+
+def _sections(config: type | Any) -> list[tuple[type | dataclasses.Field[Any], list[KeyHelp]]]:
+    """The keys that are no groups by the class that declares them, then those of each group by its field."""
     made = config() if isinstance(config, type) else config
-    sections = []
-    parts = _parts(made)
-    for part, keys in parts.items():
-        after = next((place for place, key in enumerate(keys, 1) if key.name == "prior"), 0)
-        keys[after:after] = [_ADAPTER] if after else []
-        title = inspect.cleandoc(part.__doc__ or "").partition("\n")[0].rstrip(".")
-        sections.append(f"{title}:\n" * (len(parts) > 1) + _key_rows(keys))
-    for field, group in _groups(made):
-        sections.append(_heading(field, chosen.get(field.name, ""), config_dir))
-        sections[-1] += f"\n{_key_rows(_keys(group, f'{field.name}.'))}"
-    return "\n\n".join(sections) or "  no keys"
+    parts = [(part, sorted(_keys(made, own), key=_place)) for part, own in parts_of(type(made)).items()]
+    groups = [(field, getattr(made, field.name)) for field in dataclasses.fields(made)]
+    return [
+        *sorted(((part, keys) for part, keys in parts if keys), key=lambda section: _place(section[1][0])),
+        *(
+            (field, _keys(group, dataclasses.fields(group), f"{field.name}."))
+            for field, group in groups
+            if dataclasses.is_dataclass(group) and not isinstance(group, type)
+        ),
+    ]
 
 
-def _key_rows(keys: Sequence[KeyHelp]) -> str:
-    return format_rows([(f"{key.name}={key.default}", key.meaning) for key in keys])
+def _keys(made: Any, fields: Sequence[dataclasses.Field[Any]], prefix: str = "") -> list[KeyHelp]:
+    """The keys among ``fields``; a group inside a group is one key, and the name of a component is none."""
+    meanings, keys = attribute_meanings(type(made)), []
+    for field in fields:
+        value, meaning = getattr(made, field.name), meanings.get(field.name, "")
+        if dataclasses.is_dataclass(value) and prefix:
+            inner = attribute_meanings(type(value))
+            meaning = " ".join([f"a mapping: {meaning}", *(f"{name}: {text}" for name, text in inner.items())])
+        elif dataclasses.is_dataclass(value) or (prefix and field.name == "name"):
+            continue
+        keys.append(KeyHelp(prefix + field.name, as_command_line_text(value), meaning))
+    return keys
+
+
+def _place(key: KeyHelp) -> int:
+    return _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST)
 
 
 def _heading(field: dataclasses.Field[Any], chosen: str, config_dir: str) -> str:
@@ -187,33 +177,27 @@ def format_rows(rows: Sequence[tuple[str, str]]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-@dataclass(frozen=True)
-class Sources:
-    """Sources of a command's values, besides its words.
-
-    Attributes:
-        config_dir: folder with further groups and experiments; empty for none.
-        config: ``config.yaml`` whose values take the place of the defaults; empty for none.
-    """
-
-    config_dir: str = ""
-    config: str = ""
-
-
-def compose(command: str, config: type, words: Sequence[str], sources: Sources = Sources()) -> Any:
+def compose(command: str, config: type, words: Sequence[str], config_dir: str = "", config_file: str = "") -> Any:
     """An instance of ``config`` from ``key=value`` words, options of groups and ``+experiment=NAME``.
 
     Values are written as in Hydra: numbers, ``true``, ``null``, ``[1, 2]``, ``{name: clip, high: 20}``, ``${seed}``;
     the brackets of a list may be left out. The value of a key that takes one text is that text as it stands.
+
+    Args:
+        command: the command's name, for messages.
+        config: dataclass of its keys.
+        words: what was typed.
+        config_dir: folder with further groups and experiments; empty for none.
+        config_file: ``config.yaml`` whose values take the place of the defaults; empty for none.
 
     Raises:
         UnknownNameError: no such key or option; the nearest one is offered.
         InvalidInputError: a word is not ``key=value``, or the value is not of the key's type.
     """
     fields = {field.name: field for field in dataclasses.fields(config)}
-    if sources.config_dir and not Path(sources.config_dir).is_dir():
-        raise InvalidInputError(f"--config-dir {sources.config_dir}: no such folder")
-    tree = read_config(sources.config) if sources.config else {}
+    if config_dir and not Path(config_dir).is_dir():
+        raise InvalidInputError(f"--config-dir {config_dir}: no such folder")
+    tree = read_config(config_file) if config_file else {}
     tree.pop("output", None)  # a run that is started again has a folder of its own
     choices: dict[str, str] = {}
     values: dict[str, Any] = {}
@@ -224,30 +208,27 @@ def compose(command: str, config: type, words: Sequence[str], sources: Sources =
         head = key.partition(".")[0]
         if not equals or not key:
             raise InvalidInputError(f"{command}: expected key=value, got {word!r}; --help lists the keys")
-        if key == "+experiment":
-            check_option("experiment", value, group_options("experiment", sources.config_dir))
-            choices[key] = value
-        elif key == ADAPTER and "prior" in fields:
+        if key == _ADAPTER.name and "prior" in fields:
             adapter = value
-        elif head not in fields:
-            raise unknown_name(f"{command} key", key, dotted_keys(config()))
-        elif key == "recipe":
-            check_option(key, value, group_options(key))
+        elif key == "+experiment" or (key == "recipe" and key in fields):
+            check_option(folder := key.removeprefix("+"), value, group_options(folder, config_dir))
             choices[key] = value
-        elif _is_option(fields[head], key, value, sources.config_dir):
+        elif head not in fields:
+            raise unknown_name(f"{command} key", key, dotted_values(config()))
+        elif _is_option(fields[head], key, value, config_dir):
             choices[key] = value
             values.pop(key, None)
-        elif (hint := _hint(config, key)) and _is_text(hint, value):
+        elif _is_text(hint := _hint(config, key), value):
             texts[key] = None if value == "null" and NoneType in get_args(hint) else value
         else:
             values.pop(key, None)  # later words come later
             values[key] = _parsed(command, key, value)
             if fields[head].metadata.get("named") and key == head:
                 choices.pop(key, None)
-    if sources.config and "recipe" in choices:
+    if config_file and "recipe" in choices:
         raise InvalidInputError("recipe= and --config exclude each other: the file says everything already")
     tree = {key: value for key, value in tree.items() if key not in choices}
-    made = by_hydra(command, config, choices, sources.config_dir)
+    made = by_hydra(command, config, choices, config_dir)
     for key, value in values.items():
         made = _with(made, key, value, config, tree)
     made = _resolved(command, config, made, {**plain_tree(config()), **tree})
@@ -325,22 +306,16 @@ def _parsed(command: str, key: str, value: str) -> Any:
 
 def _with(made: Mapping[str, Any], key: str, value: Any, config: type, tree: Mapping[str, Any]) -> dict[str, Any]:
     """The values with one more, by dotted key."""
-    *groups, last = key.split(".")
-    head = (groups or [last])[0]
-    (field,) = (field for field in dataclasses.fields(config) if field.name == head)
-    if not groups and not dataclasses.is_dataclass(get_type_hints(config)[head]):
+    head, *inner = key.split(".")
+    if not inner and not dataclasses.is_dataclass(_hint(config, head)):
         return {**made, key: value}
-    if groups and field.metadata.get("named") and not isinstance(made.get(head), Mapping):
+    (field,) = (field for field in dataclasses.fields(config) if field.name == head)
+    if field.metadata.get("named") and not isinstance(made.get(head), Mapping):
         before = made.get(head, tree.get(head, field.default))
         made = {**made, head: before if isinstance(before, Mapping) else {"name": before}}
-    return merged(made, _nested(key, value))
-
-
-def _nested(key: str, value: Any) -> dict[str, Any]:
-    """Nested mappings that hold one value, by its dotted key."""
-    for part in reversed(key.split(".")):
+    for part in reversed([head, *inner]):
         value = {part: value}
-    return value
+    return merged(made, value)
 
 
 def _resolved(command: str, config: type, made: dict[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
@@ -362,7 +337,7 @@ def _resolved(command: str, config: type, made: dict[str, Any], others: Mapping[
                 value = OmegaConf.to_container(value, resolve=True)
             elif isinstance(value, str) and not _is_text(_hint(config, key), value):
                 value = _parsed(command, key, value)  # the environment has texts alone
-            made = merged(made, _nested(key, value))
+            made = _with(made, key, value, config, {})
     except OmegaConfBaseException as error:
         raise InvalidInputError(
             f"{command}: {error.full_key}: {reason_of(error)}; ${{KEY}} is the value of another key, ${{oc.env:NAME}} "

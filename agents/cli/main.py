@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import functools
 import itertools
 import math
 import os
@@ -22,7 +23,8 @@ from types import ModuleType
 from typing import Any
 
 from agents.cli.commands import COMMANDS, load_command
-from agents.cli.keys import Sources, compose, format_rows, help_text, keys_of
+from agents.cli.keys import compose, format_rows, help_text, keys_of
+from agents.cli.run_folder import Run, fresh_directory
 from agents.configuration.composition import (
     PROGRESS_STYLES,
     config_text,
@@ -43,7 +45,7 @@ from scene_envs.errors import (
     UnknownNameError,
     unknown_name,
 )
-from scene_envs.files import exists, find_scenes, is_file
+from scene_envs.files import exists, find_scenes
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -76,8 +78,11 @@ _MINIMA = {
 }
 """The least that a number may be, where a config's ``LEAST`` does not say otherwise."""
 _POSITIVE = ("reward_timeout", "reward_memory")
-_DEVICES = ("cpu", "cuda", "mps", "xpu", "hpu", "mtia", "xla", "ipu", "hip", "ve", "vulkan", "maia", "lazy", "meta")
-_OTHER_DEVICES = ("privateuseone", "npu", "mlu", "musa", "mkldnn", "opengl", "opencl", "ideep", "fpga")
+_DEVICE = (
+    r"(cpu|cuda|mps|xpu|hpu|mtia|xla|ipu|hip|ve|vulkan|maia|lazy|meta|privateuseone|npu|mlu|musa|mkldnn|opengl|opencl|"
+    r"ideep|fpga)(:\d{1,4})?"
+)
+"""Devices that torch knows."""
 _DATASETS = ("data", "heldout", "regularisation.scenes")
 _GRAMMAR = "grammar"
 
@@ -179,35 +184,27 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
     shown, sweep, asked = _option(words, "--cfg", "-c"), _flag(words, "--multirun", "-m"), _flag(words, "-h", "--help")
     if shown not in ("", "job"):
         raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
-    command, sources = program.removeprefix("scene-envs "), Sources(config_dir, file)
+    command = program.removeprefix("scene-envs ")
     named = _named(words, getattr(module, "POSITIONAL", ()))
     keys = keys_of(module)
     if asked:
-        config = keys if sweep or not named else compose(command, keys, named, sources)
+        config = keys if sweep or not named else compose(command, keys, named, config_dir, file)
         print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
         return DONE
-    if not sweep:
-        settings = compose(command, keys, named, sources)
-        _check(settings, allow_local, bool(shown), module)
-        return _run(command, module, settings, bool(shown))
-    runs = [(compose(command, keys, variant, sources), label) for variant, label in expand_sweeps(named)]
-    for settings, _ in runs:
-        _check(settings, allow_local, bool(shown), module)
-    return _run_all(command, module, runs, bool(shown))
-
-
-def _check(settings: Any, allow_local: bool, only_show: bool, module: ModuleType) -> None:
-    """Refuse wrong values that early checks can find; ask before one of the user's files is run."""
-    if only_show:
-        return
-    check_early(settings, module)
-    for key in ("reward", "objective"):
-        if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
-            _ask_for_files(key, getattr(settings, key), allow_local)
-    if isinstance(seed := getattr(settings, "seed", 0), int) and not 0 <= seed < 2**63:
-        raise InvalidInputError(f"seed={seed} must be from 0 to 2^63 - 1")
-    if isinstance(device := getattr(settings, "device", "cpu"), str) and device != "cpu":
-        check_device(device)
+    if sweep and not getattr(module, "WRITES", True):
+        raise InvalidInputError(f"--multirun: {command} writes no folder; run it once for each value")
+    variants = expand_sweeps(named) if sweep else [(named, "")]
+    runs = [(compose(command, keys, variant, config_dir, file), label) for variant, label in variants]
+    for settings, _ in runs if not shown else ():
+        _check(settings, module, allow_local)
+    folder = ""
+    for settings, label in runs:
+        if sweep:  # each run has a folder of its own below ``output``
+            folder = settings.output or folder or fresh_directory(command)
+            settings = replace(settings, output=str(Path(folder) / label))
+            print(f"{'# ' * bool(shown)}{command} {label}", flush=True)
+        _run(command, module, settings, bool(shown))
+    return DONE
 
 
 def _ask_for_files(key: str, reward: Any, allow_local: bool) -> None:
@@ -225,35 +222,15 @@ def _ask_for_files(key: str, reward: Any, allow_local: bool) -> None:
         allow_local_rewards(path)
 
 
-def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> int:
-    from agents.cli.run_folder import Run, fresh_directory
-
+def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> None:
     if only_show:
         print(config_text(settings), end="")
-        return DONE
-    if not getattr(module, "WRITES", True):
+    elif not getattr(module, "WRITES", True):
         module.run(settings)
-        return DONE
-    if not settings.output:
-        settings = replace(settings, output=fresh_directory(command))
-    with Run(command, settings) as run:
-        module.run(settings, run)
-    return DONE
-
-
-def _run_all(command: str, module: ModuleType, runs: Sequence[tuple[Any, str]], only_show: bool) -> int:
-    """One run after the other, each in a folder of its own below ``output``; the first that fails ends them."""
-    from agents.cli.run_folder import fresh_directory
-
-    if not getattr(module, "WRITES", True):
-        raise InvalidInputError(f"--multirun: {command} writes no folder; run it once for each value")
-    folder = ""
-    for settings, label in runs:
-        folder = settings.output or folder or fresh_directory(command)
-        own = replace(settings, output=str(Path(folder) / label))
-        print(f"{'# ' * only_show}{command} {label}", flush=True)
-        _run(command, module, own, only_show)
-    return DONE
+    else:
+        settings = settings if settings.output else replace(settings, output=fresh_directory(command))
+        with Run(command, settings) as run:
+            module.run(settings, run)
 
 
 def _option(words: list[str], *names: str) -> str:
@@ -310,15 +287,14 @@ def _at(error: OSError) -> str:
     return f" at {error.filename!r}" if error.filename else ""
 
 
-def _cut(error: BaseException) -> str:
-    text = str(error)
+def _cut(message: object) -> str:
+    text = str(message)
     return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}..."
 
 
 def _complain(text: str, status: int) -> int:
-    text = text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}..."
     with contextlib.suppress(OSError):  # stderr may be closed
-        print(f"scene-envs: {text}".encode(errors="backslashreplace").decode(), file=sys.stderr)
+        print(f"scene-envs: {_cut(text)}".encode(errors="backslashreplace").decode(), file=sys.stderr)
     return status
 
 
@@ -356,22 +332,16 @@ def _values(word: str) -> list[str]:
 # Checks of values that need no torch: names, paths and numbers
 
 
-def check_early(settings: Any, module: ModuleType | None = None) -> None:
-    """Refuse unknown names, wrong paths and numbers out of range.
-
-    Args:
-        settings: the config of a command.
-        module: module of the command, whose ``check(settings)`` is called where it has one.
-
-    Raises:
-        InvalidInputError: a number is outside its range, or nothing is at a path.
-        UnknownNameError: no such prior, reward, scene type or mask; the nearest known one is offered.
-    """
+def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
+    """Refuse wrong values that can be found before the work starts; ask before one of the user's files is run."""
     _check_numbers(settings)
     if (own := getattr(module, "check", None)) is not None:
         own(settings)
     if (prior := getattr(settings, "prior", None)) and isinstance(prior, str):
-        _check_prior(prior)
+        own_name, adapters = split_name(prior)
+        find_prior(own_name)
+        for part in adapters.split("+") if adapters and not exists(Path(adapters)) else ():
+            find_prior(part.rpartition("*")[2].strip())
     for key in ("reward", "objective"):
         _check_name("reward", getattr(settings, key, None), known_rewards)
     if (scene := getattr(settings, "scene", None)) is not None and not isinstance(scene, str):
@@ -380,8 +350,9 @@ def check_early(settings: Any, module: ModuleType | None = None) -> None:
         _check_name("scene type", scene, known_scenes)
     for mask in [getattr(settings, "mask", None), *(getattr(settings, "masks", None) or [])]:
         _check_name("mask", mask, known_masks)
-    if isinstance(device := getattr(settings, "device", "cpu"), str):
-        _check_device(device)
+    device = getattr(settings, "device", "cpu")
+    if not re.fullmatch(_DEVICE, device):
+        raise InvalidInputError(f"device={device[:60]!r} is no torch device; give cpu, cuda or cuda:1")
     if hasattr(settings, "progress"):
         require_one_of(settings, "progress", PROGRESS_STYLES)
     if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
@@ -389,15 +360,13 @@ def check_early(settings: Any, module: ModuleType | None = None) -> None:
     resumed = exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
     kept = {"regularisation.scenes"} if resumed else set()  # a resumed run has them in its folder
     for key in set(_DATASETS) - kept - set(getattr(settings, "NO_PATHS", ())):
-        _check_dataset(key, _dotted(settings, key))
+        _check_dataset(key, functools.reduce(lambda value, part: getattr(value, part, None), key.split("."), settings))
     _check_guidance(settings)
-
-
-def check_files(*paths: str) -> None:
-    """Refuse paths at which there is no file."""
-    for path in paths:
-        if not is_file(Path(path)):
-            raise InvalidInputError(f"{path[:200]!r} is no file; name one that is there")
+    for key in ("reward", "objective"):
+        if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
+            _ask_for_files(key, getattr(settings, key), allow_local)
+    if device != "cpu":
+        check_device(device)
 
 
 def _check_numbers(settings: Any) -> None:
@@ -413,15 +382,8 @@ def _check_numbers(settings: Any) -> None:
     for key in _POSITIVE:
         if isinstance(value := getattr(settings, key, None), int | float) and not value > 0:
             raise InvalidInputError(f"{key}={value} must be more than 0")
-
-
-def _check_prior(name: str) -> None:
-    own, adapters = split_name(name)
-    find_prior(own)
-    if not adapters or exists(Path(adapters)):
-        return
-    for part in adapters.split("+"):
-        find_prior(part.rpartition("*")[2].strip())
+    if isinstance(seed := getattr(settings, "seed", 0), int) and not 0 <= seed < 2**63:
+        raise InvalidInputError(f"seed={seed} must be from 0 to 2^63 - 1")
 
 
 def _check_name(kind: str, value: Any, known: Callable[[], Sequence[str]]) -> None:
@@ -429,12 +391,6 @@ def _check_name(kind: str, value: Any, known: Callable[[], Sequence[str]]) -> No
     name = value.get("name") if isinstance(value, dict) else value
     if isinstance(name, str) and name.isidentifier() and name not in (names := known()):
         raise unknown_name(kind, name, names)
-
-
-def _check_device(device: str) -> None:
-    found = re.fullmatch(r"([a-z]+)(:\d{1,4})?", device)
-    if not found or found[1] not in (*_DEVICES, *_OTHER_DEVICES):
-        raise InvalidInputError(f"device={device[:60]!r} is no torch device; give cpu, cuda or cuda:1")
 
 
 def _check_dataset(key: str, value: Any) -> None:
@@ -451,6 +407,8 @@ def _check_dataset(key: str, value: Any) -> None:
 
 
 def _check_guidance(settings: Any) -> None:
+    from scene_envs.envs.settings import check_claim_guidance, check_physics_guidance
+
     prompt, guidance = getattr(settings, "prompt", None), getattr(settings, "guidance", 0.0)
     if not math.isfinite(guidance):
         raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
@@ -459,19 +417,9 @@ def _check_guidance(settings: Any) -> None:
 
         check_prompt(prompt, guidance)
     if strength := getattr(settings, "claim_guidance", 0.0):
-        from scene_envs.envs.settings import check_claim_guidance
-
         check_claim_guidance(prompt if hasattr(settings, "prompt") else "those of real scenes", strength)
     if strength := getattr(settings, "physics_guidance", 0.0):
-        from scene_envs.envs.settings import check_physics_guidance
-
         check_physics_guidance(strength)
-
-
-def _dotted(settings: Any, key: str) -> Any:
-    for part in key.split("."):
-        settings = getattr(settings, part, None)
-    return settings
 
 
 def check_device(name: str) -> None:
@@ -488,8 +436,7 @@ def check_device(name: str) -> None:
         device = torch.device(name)
         torch.empty(1, device=device)
     except Exception:  # each backend has errors of its own
-        here = ["cpu"]
-        here += [f"cuda:{index}" for index in range(torch.cuda.device_count())]
+        here = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
         raise InvalidInputError(
             f"device={str(name)[:60]!r} is not a torch device of this machine; use one of {', '.join(here)}"
         ) from None

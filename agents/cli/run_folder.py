@@ -13,7 +13,6 @@ from types import TracebackType
 from typing import Any
 
 from agents.configuration.composition import config_text, dotted
-from agents.utils.process_group import is_first_process, launched_processes
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import claimed, read_sealed, sealed, storage_error, write_json, write_text
 
@@ -80,6 +79,8 @@ class Run:
     """
 
     def __init__(self, command: str, settings: Any) -> None:
+        from agents.utils.process_group import is_first_process
+
         self.command = command
         self.settings = settings
         self.directory = Path(settings.output)
@@ -89,21 +90,19 @@ class Run:
         self._claim = ExitStack()
 
     def __enter__(self) -> Run:
-        self._claim = ExitStack()
         if not self._is_first:
             self._make_folder()
             return self
         self._claim.enter_context(claimed(self.directory, f"scene-envs {self.command}"))
         try:
-            self._is_repeated = self._check_folder()
             self._before = _empty_files(self.directory)
-            if not self._is_repeated:
+            if not self._holds_results():
                 self.write_config()
             self._start_logging()
             self.log(f"scene-envs {self.command}")
         except BaseException as error:
             self._claim.close()
-            if isinstance(error, OSError) and not isinstance(error, InvalidInputError):
+            if isinstance(error, OSError):
                 raise storage_error(self.directory, error) from error
             raise
         return self
@@ -114,22 +113,19 @@ class Run:
         except (FileExistsError, NotADirectoryError):
             raise InvalidInputError(f"output={str(self.directory)!r} is a file, not a folder; give another") from None
 
-    def _check_folder(self) -> bool:
+    def _holds_results(self) -> bool:
         """Whether the folder holds results of this command; refuses those of another, or of other keys."""
         found = [name for name in _RESULTS if (self.directory / name).exists()]
         writer = _writer(self.directory)
-        if not found and writer == self.command:
-            return False
-        if writer is not None:
+        if writer is not None and (found or writer != self.command):
             found += [name for name in _PARTS if (self.directory / name).exists()]
         if not found:
             return False
         if writer is None and _RESUMES.get(self.command) in found:
             return True
         if writer != self.command:
-            raise InvalidInputError(
-                f"output={str(self.directory)!r} holds {found[0]} of {_named(writer)}; give another output"
-            )
+            other = "another program" if writer is None else f"scene-envs {writer}"
+            raise InvalidInputError(f"output={str(self.directory)!r} holds {found[0]} of {other}; give another output")
         if self.command not in _OWN_RULE and not getattr(self.settings, "compares_keys", False):
             self._check_keys()
         return True
@@ -146,8 +142,7 @@ class Run:
             raise _unreadable(path, " ".join(str(error).split())) from error
         if not isinstance(before, dict):
             raise _unreadable(path, f"{str(path)!r} holds no keys")
-        now = yaml.safe_load(config_text(self.settings))
-        was, is_now = dotted(before), dotted(now)
+        was, is_now = dotted(before), dotted(yaml.safe_load(config_text(self.settings)))
         changed = [
             f"{key} was {was[key]!r}, is {is_now[key]!r}"
             for key in is_now
@@ -235,10 +230,6 @@ def _writer(folder: Path) -> str | None:
     return None
 
 
-def _named(writer: str | None) -> str:
-    return "another program" if writer is None else f"scene-envs {writer}"
-
-
 def _empty_files(folder: Path) -> set[Path]:
     return {path for path in folder.rglob("*") if path.is_file() and not path.stat().st_size and path.name != "log.txt"}
 
@@ -249,6 +240,8 @@ def fresh_directory(command: str) -> str:
     Raises:
         InvalidInputError: this is one of several processes, which need the same folder.
     """
+    from agents.utils.process_group import launched_processes
+
     if (count := launched_processes()) > 1:
         raise InvalidInputError(
             f"the {count} processes of this run share a folder; give output=, such as runs/{command}"

@@ -143,16 +143,10 @@ def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, com
             raise InvalidInputError(
                 f"{path}={as_command_line_text(value)}: {path} is a group of keys; give one of {keys}"
             )
-        return build(kind_of(field, hint, value), value, f"{path}.", command)
+        if find := field.metadata.get("kinds"):  # the name of a component decides which settings it has
+            hint = find(value["name"] if "name" in value else default_of(field).name)
+        return build(hint, value, f"{path}.", command)
     return _scalar(hint, value, path)
-
-
-def kind_of(field: dataclasses.Field[Any], hint: type, value: Mapping[str, Any]) -> type:
-    """The dataclass of a group's settings, which its ``name`` decides where components are registered."""
-    find: Callable[[str], type] | None = field.metadata.get("kinds")
-    if find is None:
-        return hint
-    return find(value["name"] if "name" in value else default_of(field).name)
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:
@@ -200,7 +194,7 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
     for key, value in changes.items():
         head, dot, rest = key.partition(".")
         if head not in known:
-            raise unknown_name("key", key, dotted_keys(config))
+            raise unknown_name("key", key, dotted_values(config))
         if dot:
             groups.setdefault(head, {})[rest] = value
         else:
@@ -209,18 +203,13 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
     return dataclasses.replace(config, **{**values, **nested})  # type: ignore[type-var]
 
 
-def dotted_keys(config: Any) -> list[str]:
-    """All keys of a config; a key of a group stands behind the name of the group and a dot."""
-    return list(dotted_values(config))
-
-
 def dotted_values(config: Any) -> dict[str, Any]:
-    """All values of a config by :func:`dotted_keys`."""
+    """All values of a config; a key of a group stands behind the name of the group and a dot."""
     values: dict[str, Any] = {}
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
+    for name in [field.name for field in dataclasses.fields(config)]:
+        value = getattr(config, name)
         inner = dotted_values(value) if dataclasses.is_dataclass(value) else None
-        values |= {field.name: value} if inner is None else {f"{field.name}.{key}": item for key, item in inner.items()}
+        values |= {name: value} if inner is None else {f"{name}.{key}": item for key, item in inner.items()}
     return values
 
 
@@ -499,21 +488,21 @@ def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str =
     from hydra.core.config_store import ConfigStore
     from omegaconf import OmegaConf
 
-    groups = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("folder")}
-    keys = {name: field.metadata["folder"] for name, field in groups.items()}
-    paths = {name: folder if folder == name else f"{folder}@{name}" for name, folder in keys.items()}
-    store = ConfigStore.instance()
-    for name, folder in keys.items():
-        found = groups[name].metadata["registered"]()
+    store, paths = ConfigStore.instance(), {}
+    for field in dataclasses.fields(kind):
+        if not (folder := field.metadata.get("folder")):
+            continue
+        paths[field.name] = folder if folder == field.name else f"{folder}@{field.name}"
+        found = field.metadata["registered"]()
         nodes = found if isinstance(found, Mapping) else {option: {"name": option} for option in found}
         store.repo.pop(folder, None)
         for option in nodes.keys() - set(group_options(folder, config_dir)):  # a file takes the place of a node
             store.store(group=folder, name=option, node=dict(nodes[option]))
-    defaults: list[Any] = ["_self_", *({path: None} for path in paths.values())]
-    defaults += [{"recipe": None}] if any(field.name == "recipe" for field in dataclasses.fields(kind)) else []
-    store.store(name="primary", node={"defaults": defaults})
+    recipe = ["recipe" for field in dataclasses.fields(kind) if field.name == "recipe"]
+    defaults = ["_self_", *({path: None} for path in [*paths.values(), *recipe])]
+    places = [f"file://{Path(config_dir).resolve()}"] if config_dir else []
+    store.store(name="primary", node={"defaults": defaults, "hydra": {"searchpath": places}})
     words = [f"{paths.get(key, key)}={option}" for key, option in choices]
-    words += [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
     with initialize_config_module("configs", version_base="1.3"):
         made = OmegaConf.to_container(compose("primary", overrides=words), resolve=False)
     assert isinstance(made, dict)
@@ -603,22 +592,31 @@ class ProgressKeys:
 
 
 @dataclass
-class SamplingKeys:
-    """Sampling of scenes.
+class PromptKeys:
+    """Prompt of the scenes.
 
     Attributes:
         prompt: text that the scenes should match, for priors that read prompts; null for no prompt.
         guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         claim_guidance: strength with which scenes are guided to the numbers and places that the prompt gives, 0 for
             none; 2 is a good choice; needs a prompt.
-        num_steps: denoising steps per scene.
-        slots: slots per scene, which may exceed the number in training; null takes the number in training.
-        seed: seed of the noise.
     """
 
     prompt: str | None = None
     guidance: float = 0.0
     claim_guidance: float = 0.0
+
+
+@dataclass
+class SamplingKeys(PromptKeys):
+    """Sampling of scenes.
+
+    Attributes:
+        num_steps: denoising steps per scene.
+        slots: slots per scene, which may exceed the number in training; null takes the number in training.
+        seed: seed of the noise.
+    """
+
     num_steps: int = 50
     slots: int | None = None
     seed: int = 0
@@ -626,17 +624,18 @@ class SamplingKeys:
 
 @dataclass
 class DrawKeys(DeviceKeys):
-    """Sampling from a prior, with prior=.
+    """Samples of a prior.
 
     Attributes:
-        num_steps: denoising steps per scene, with prior=.
+        num_steps: denoising steps per scene.
         physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps, 0
-            to 1, with prior=; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0 for
-            the others.
+            to 1; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0 for the others.
+        seed: seed of the noise.
     """
 
     num_steps: int = 50
     physics_guidance: float | None = None
+    seed: int = 0
 
 
 @dataclass

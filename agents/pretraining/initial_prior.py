@@ -238,8 +238,8 @@ def _chain(config: PretrainConfig) -> dict[str, Any]:
     return {
         "schedule": process.schedule,
         "prediction": process.prediction,
-        "noise_floor": process.noise_floor,
-        "noise_ceiling": process.noise_ceiling,
+        "noise_floor": process.noise.floor,
+        "noise_ceiling": process.noise.ceiling,
         "noise_mean": loss.noise.mean,
         "noise_std": loss.noise.std,
         "timesteps": loss.timesteps,

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 from agents.configuration.composition import (
     LoggerSettings,
     OptimizerSettings,
+    ProgressKeys,
     TrainingKeys,
     composed,
     named,
@@ -126,6 +127,25 @@ class NetworkSettings:
 
 
 @dataclass
+class NoiseRange:
+    """Noise-to-signal ratios of a karras schedule.
+
+    Attributes:
+        floor: the lowest, in normalised units.
+        ceiling: the highest.
+    """
+
+    floor: float = 0.002
+    ceiling: float = 20.0
+
+    def __post_init__(self) -> None:
+        require_positive(self, "floor", "ceiling")
+        require_finite(self, "ceiling")
+        if not self.floor < self.ceiling:
+            raise InvalidInputError(f"floor={self.floor} of the noise must be less than ceiling={self.ceiling}")
+
+
+@dataclass
 class ProcessSettings:
     """The diffusion process, and what is made of the network's output.
 
@@ -134,8 +154,7 @@ class ProcessSettings:
         prediction: target of the network: ``edm`` (preconditioning of Karras et al. 2022), ``epsilon``, ``x0`` or
             ``v``.
         schedule: noise schedule: ``karras``, ``linear`` or ``cosine``.
-        noise_floor: lowest noise-to-signal ratio of the karras schedule, in normalised units.
-        noise_ceiling: highest noise-to-signal ratio of the karras schedule.
+        noise: noise-to-signal ratios of the karras schedule.
         moments: mean and standard deviation that scale the network's output: of each ``category`` (of each feature in a
             continuous process), of each ``feature``, or of the whole ``scene``.
         rotation: numbers that a continuous prior diffuses for a rotation: ``matrix``, ``quaternion`` or ``axis_angle``.
@@ -153,8 +172,7 @@ class ProcessSettings:
     name: str = "mixed"
     prediction: str = "edm"
     schedule: str = "karras"
-    noise_floor: float = 0.002
-    noise_ceiling: float = 20.0
+    noise: NoiseRange = nested(NoiseRange)
     moments: str = "category"
     rotation: str = "matrix"
     kernel: str = "early_absorbing"
@@ -172,13 +190,7 @@ class ProcessSettings:
         require_one_of(self, "kernel", kernels, "categorical kernel")
         require_one_of(self, "empty_slots", ("attended", "dropped"), "treatment of empty slots")
         require_one_of(self, "unmasking", ("systematic", "even", "independent"))
-        require_positive(self, "noise_floor", "noise_ceiling")
-        require_finite(self, "noise_ceiling")
         require_at_least(self, 0, "denoised_clip")
-        if not self.noise_floor < self.noise_ceiling:
-            raise InvalidInputError(
-                f"noise_floor={self.noise_floor} must be less than noise_ceiling={self.noise_ceiling}"
-            )
 
 
 @dataclass
@@ -394,10 +406,11 @@ class SceneKeys:
 
 @composed
 @dataclass
-class PretrainConfig(SceneKeys, TrainingKeys):
+class PretrainConfig(SceneKeys, TrainingKeys, ProgressKeys):
     """One pretraining run.
 
-    Keys that are not listed are those of :class:`~agents.configuration.composition.TrainingKeys`.
+    Keys that are not listed are those of :class:`~agents.configuration.composition.TrainingKeys` and
+    :class:`~agents.configuration.composition.ProgressKeys`.
 
     Attributes:
         scene: scene type. This key is ignored with ``prior=`` and with several datasets, which define the union of

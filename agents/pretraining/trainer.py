@@ -32,13 +32,14 @@ from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError
 from scene_envs.files import claimed, sealed, write_json, write_text
+from scene_envs.progress import Progress
 from scene_envs.scene import POSE_FEATURES
 
 logger = logging.getLogger(__name__)
 
 FIELDS = ("step", "loss", "heldout", "gradient_norm", "learning_rate", "seconds")
 """Columns of ``log.csv``."""
-_MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe")
+_MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe", "progress")
 """Keys that may change between a run and its continuation."""
 _RESIDUAL = 512
 """Number of held-out scenes on which the residual error of the denoiser is measured."""
@@ -73,11 +74,9 @@ class TrainingLog:
         writer.writerows(kept[number] for number in sorted(kept))
         write_text(path, text.getvalue())
 
-    def write(self, row: dict[str, float], last_step: int) -> None:
-        """Write one row; the time left is estimated from ``last_step``."""
-        step, seconds = int(row["step"]), row["seconds"]
-        left = (last_step - step) * seconds / max(1, step)
-        logger.info("%s  left %.0f s", "  ".join(f"{key} {value:.6g}" for key, value in row.items()), left)
+    def write(self, row: dict[str, float]) -> None:
+        """Write one row."""
+        logger.debug("%s", "  ".join(f"{key} {value:.6g}" for key, value in row.items()))
         path = self.directory / "log.csv"
         fresh = not path.exists()
         with path.open("a", newline="") as file:
@@ -85,7 +84,7 @@ class TrainingLog:
             if fresh:
                 writer.writeheader()
             writer.writerow(row)
-        self.also.log({key: value for key, value in row.items() if key != "step"}, step)
+        self.also.log({key: value for key, value in row.items() if key != "step"}, int(row["step"]))
 
 
 def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> None:
@@ -165,10 +164,11 @@ class Pretrainer:
             self.prior.denoiser.network.compile()
         if self.processes.is_first:
             self.log.begin(self.step)
-        with finishing_steps() as end:
+        with finishing_steps() as end, self._progress() as progress:
             for row in self._steps(end):
                 if self.processes.is_first:
-                    self.log.write(row, self.config.iterations)
+                    self._show(progress, row)
+                    self.log.write(row)
         self.log.also.close()
         if self.processes.is_first:
             logger.info("measuring the residual error at 40 noise levels, for the samplers")
@@ -185,6 +185,17 @@ class Pretrainer:
         if warm_up_text(self.prior, self.data, steps, self.config.batch_size, self.config.seed) is not None:
             self.processes.share(self.network.parameters())
             self.average = WeightAverage(self.network, self.config.optimizer.ema)
+
+    def _progress(self) -> Progress:
+        style = self.config.progress if self.processes.is_first else "none"
+        return Progress("pretraining", self.config.iterations, done=self.step, style=style)
+
+    def _show(self, progress: Progress, row: Mapping[str, float]) -> None:
+        step, total = int(row["step"]), self.config.iterations
+        heldout = f"  held-out {self.evaluations[-1]['heldout']:.4g}" if self.evaluations else ""
+        text = f"loss {row['loss']:.4g}{heldout}"
+        left = row["seconds"] / max(1, step) * (total - step)
+        progress.update(step, text, f"pretraining {step}/{total}  {text}  {left:.0f} s left")
 
     def _steps(self, end: Ending) -> Iterator[dict[str, float]]:
         started, config = time.perf_counter() - self.seconds, self.config

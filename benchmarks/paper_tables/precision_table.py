@@ -42,8 +42,8 @@ FACTORS: tuple[Setting, ...] = (
     *_predictions("none", "", "edm", "epsilon", "v", "x0"),
     *_predictions("min_snr", ", min-SNR", "epsilon", "v", "x0"),
     *_each("schedule", "process.schedule", "karras", "cosine", "linear"),
-    *_each("noise floor", "process.noise_floor", 0.01, 0.002, 0.0005),
-    *_each("noise ceiling", "process.noise_ceiling", 20.0, 80.0),
+    *_each("noise floor", "process.noise.floor", 0.01, 0.002, 0.0005),
+    *_each("noise ceiling", "process.noise.ceiling", 20.0, 80.0),
     *_each("timesteps", "loss.timesteps", "lognormal", "uniform", "both"),
     *_each("moments per", "process.moments", "scene", "feature", "category"),
     *_each("translation weight", "loss.translation_weight", 1.0, 3.0),
@@ -64,8 +64,8 @@ FACTORS: tuple[Setting, ...] = (
 """Settings that the precision table changes, one at a time."""
 
 _NEEDS = {
-    "process.noise_floor": ("process.schedule", "karras"),
-    "process.noise_ceiling": ("process.schedule", "karras"),
+    "process.noise.floor": ("process.schedule", "karras"),
+    "process.noise.ceiling": ("process.schedule", "karras"),
     "process.moments": ("process.prediction", "edm"),
     "network.modules.contacts": ("network.modules.relations", "axis"),
 }

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from agents.configuration.composition import changed, dotted_keys, dotted_values
+from agents.configuration.composition import changed, dotted_values
 from agents.pretraining.settings import PretrainConfig
 from benchmarks.paper_tables.data import RowData, trained_numbers
 from benchmarks.paper_tables.rows import Row
@@ -49,7 +49,7 @@ def run_config(row: Row, settings: TablesConfig, hidden: int | None = None) -> P
         UnknownNameError: a key that ``pretrain`` does not have.
     """
     keys: dict[str, Any] = {**settings.common(), **row.overrides}
-    known = dotted_keys(PretrainConfig())
+    known = list(dotted_values(PretrainConfig()))
     for key in keys:
         if key not in known:
             raise unknown_name("pretrain key", key, known)

@@ -73,7 +73,7 @@ def test_every_factor_is_asked() -> None:
     assert {("process.prediction", name) for name in ("epsilon", "v", "x0", "edm")} <= asked
     assert {("process.schedule", name) for name in ("linear", "cosine", "karras")} <= asked
     assert {("process.moments", name) for name in ("scene", "feature", "category")} <= asked
-    assert {("process.noise_floor", value) for value in (0.01, 0.002, 0.0005)} <= asked
+    assert {("process.noise.floor", value) for value in (0.01, 0.002, 0.0005)} <= asked
     assert {("loss.translation_weight", 1.0), ("loss.translation_weight", 3.0)} <= asked
     assert {("optimizer.rate.final", 1.0), ("optimizer.rate.decay", 1.0)} <= asked
     assert {("network.modules.rotation_features", True), ("network.modules.rotation_features", False)} <= asked

@@ -214,7 +214,7 @@ def test_a_log_has_no_row_twice_and_none_of_another_run(tmp_path):
 
     log = TrainingLog(tmp_path)
     for step in (1, 2, 3, 2, 3, 4):
-        log.write({name: float(step) for name in FIELDS} | {"step": step}, 5)
+        log.write({name: float(step) for name in FIELDS} | {"step": step})
     with (tmp_path / "log.csv").open("a") as file:
         file.write("5,0.")  # killed while it wrote
     log.begin(3)

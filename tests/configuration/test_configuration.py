@@ -14,7 +14,7 @@ import yaml
 from agents import PostTrainConfig, PretrainConfig, SearchConfig
 from agents.cli import main
 from agents.cli.commands import COMMANDS, load_command
-from agents.cli.keys import Sources, compose, help_text, keys_of
+from agents.cli.keys import compose, help_text, keys_of
 from agents.cli.main import expand_sweeps
 from agents.configuration.composition import changed, config_text, dotted_values, field_options
 from agents.planning import list_planners
@@ -148,16 +148,16 @@ def test_wrong_values_in_python_are_named(make: Any, message: str) -> None:
 def test_a_written_config_gives_the_same_settings(command: str, tmp_path: Path) -> None:
     kind = CONFIGS[command]
     (tmp_path / "config.yaml").write_text(config_text(kind()))
-    assert compose(command, kind, [], Sources(config=str(tmp_path / "config.yaml"))) == kind()
+    assert compose(command, kind, [], config_file=str(tmp_path / "config.yaml")) == kind()
 
 
 def test_words_win_over_a_file(tmp_path: Path) -> None:
     settings = PostTrainConfig(recipe="demo_clutter", algorithm="ddpo_is", reward={"name": "clip", "high": 3})
     (tmp_path / "config.yaml").write_text(config_text(settings))
-    source = Sources(config=str(tmp_path / "config.yaml"))
-    assert compose("post-train", PostTrainConfig, [], source) == settings
+    source = str(tmp_path / "config.yaml")
+    assert compose("post-train", PostTrainConfig, [], config_file=source) == settings
     words = ["algorithm=ddpo_sf", "seed=3", "reward=object_count", "optimizer.lr=0.5"]
-    found = compose("post-train", PostTrainConfig, words, source)
+    found = compose("post-train", PostTrainConfig, words, config_file=source)
     assert (found.algorithm.name, found.seed, found.reward, found.optimizer.lr) == ("ddpo_sf", 3, "object_count", 0.5)
     assert found.iterations == settings.iterations
 
@@ -201,11 +201,12 @@ def test_values_that_cannot_be_read_are_named(word: str, message: str) -> None:
 
 def test_an_experiment_reads_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ITERATIONS", "7")
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment" / "env.yaml").write_text(
+    folder = tmp_path / "a, [b] c=1"  # words of Hydra's grammar
+    (folder / "experiment").mkdir(parents=True)
+    (folder / "experiment" / "env.yaml").write_text(
         "# @package _global_\ndefaults: [{override /algorithm: nft}]\niterations: ${oc.env:ITERATIONS}\n"
     )
-    found = compose("post-train", PostTrainConfig, ["+experiment=env"], Sources(config_dir=str(tmp_path)))
+    found = compose("post-train", PostTrainConfig, ["+experiment=env"], config_dir=str(folder))
     assert (found.iterations, found.algorithm.name) == (7, "nft")
 
 

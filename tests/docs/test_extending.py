@@ -15,7 +15,7 @@ import yaml
 
 from agents import PostTrainConfig, PretrainConfig
 from agents.cli import main
-from agents.cli.keys import Sources, compose
+from agents.cli.keys import compose
 from agents.planning.ledger import planner_settings
 from agents.post_training import DDPOSFLoss, DenoisingPolicy, compute_advantages
 from agents.post_training.rollouts import collect
@@ -200,7 +200,7 @@ def test_an_experiment_with_the_algorithm_and_the_reward_runs_twice_alike(
 def test_the_network_has_its_keys_on_the_command_line_and_in_python(folder: str, tmp_path: Path) -> None:
     """The scene type and the network have tests of their own, in the folders of grammars and of networks."""
     words = ["network=deep_sets", "network.depth=2"]
-    composed = compose("pretrain", PretrainConfig, words, Sources(config_dir=folder))
+    composed = compose("pretrain", PretrainConfig, words, config_dir=folder)
     assert (composed.network.name, composed.network.hidden, composed.network.depth) == ("deep_sets", 16, 2)
     assert PretrainConfig(network="deep_sets").network.name == "deep_sets"  # without its YAML
     assert PostTrainConfig(algorithm="proximal").algorithm.penalty == 1.0  # type: ignore[attr-defined]

@@ -14,7 +14,7 @@ from scene_envs.errors import MissingDependencyError, UnknownNameError
 
 def test_csv_adds_nothing_to_the_log_of_the_run(tmp_path: Path) -> None:
     log = TrainingLog(tmp_path, make_logger("csv", tmp_path))
-    log.write({"step": 5, "loss": 0.5, "seconds": 1.0}, last_step=10)
+    log.write({"step": 5, "loss": 0.5, "seconds": 1.0})
     log.also.close()
     assert [path.name for path in tmp_path.iterdir()] == ["log.csv"]
     assert (tmp_path / "log.csv").read_text().splitlines()[1] == "5,0.5,,,,1.0"
@@ -26,7 +26,7 @@ def test_tensorboard_gets_every_figure_at_its_step(tmp_path: Path) -> None:
 
     log = TrainingLog(tmp_path, make_logger("tensorboard", tmp_path))
     for step in (5, 10):
-        log.write({"step": step, "loss": 1.0 / step, "seconds": 0.5 * step}, last_step=10)
+        log.write({"step": step, "loss": 1.0 / step, "seconds": 0.5 * step})
     log.also.close()
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert set(events.Tags()["scalars"]) == {"loss", "seconds"}

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from agents.cli.run_folder import Run
 from agents.configuration.composition import DeviceKeys, ProgressKeys
-
-if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
 
 
 @dataclass

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from agents.cli.run_folder import Run
 from agents.post_training.settings import PostTrainConfig
-
-if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
 
 
 def run(settings: PostTrainConfig, run: Run) -> None:

@@ -10,13 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.configuration.composition import MEASURE_NAMES, OutputKeys
+from agents.cli.commands.scenes import check_files, draw, draw_scenes, load_prior
+from agents.cli.run_folder import Run
+from agents.configuration.composition import MEASURE_NAMES, DrawKeys, OutputKeys
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, unknown_name
+from scene_envs.files import with_digest, without_digest, write_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from agents.cli.run_folder import Run
     from agents.priors.prior import ScenePrior
     from scene_envs.scene import SceneBatch
 
@@ -44,20 +46,16 @@ class RealSceneKeys:
 
 
 @dataclass
-class EvaluateConfig(RealSceneKeys, OutputKeys):
+class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
     """Measures of a prior's raw samples, each beside that of real scenes.
 
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
         count: number of samples, and of real scenes in each of the two sets for comparison.
         prompt_count: number of samples with prompts of held-out scenes, at most count; null takes count.
-        num_steps: denoising steps per sample.
         guidance: weight of classifier-free guidance for the samples with prompts, 0 for none.
         claim_guidance: strength with which samples are guided to the numbers and places that their prompts give, 0 for
             none.
-        physics_guidance: strength with which objects of all samples are moved out of overlaps and onto supports at the
-            last steps, 0 to 1; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0
-            for the others.
         seed: seed of the samples, the real scenes and the classifiers.
         measures: all, or some of layout, physics, ready, fsd, novelty, prompts, classifier, renders, fid, written as
             layout or [layout, physics].
@@ -71,11 +69,8 @@ class EvaluateConfig(RealSceneKeys, OutputKeys):
     prior: str = "dimsum_table"
     count: int = 200
     prompt_count: int | None = None
-    num_steps: int = 50
     guidance: float = 0.0
     claim_guidance: float = 0.0
-    physics_guidance: float | None = None
-    seed: int = 0
     measures: Any = "all"
     project: bool = True
     fid_weights: str = ""
@@ -118,7 +113,7 @@ def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> l
 
 def check(settings: EvaluateConfig) -> None:
     """Refuse impossible settings before the prior is read."""
-    groups = choose_measures(settings.measures, project=settings.project)
+    choose_measures(settings.measures, project=settings.project)
     if settings.heldout and not settings.data:
         raise InvalidInputError("heldout= needs data=, the dataset that the prior was trained on")
     if settings.prompt_count is not None and not 2 <= settings.prompt_count <= settings.count:
@@ -126,22 +121,18 @@ def check(settings: EvaluateConfig) -> None:
             f"prompt_count={settings.prompt_count} must be from 2 to count={settings.count}, whose scenes the prompts "
             "are of; null takes all of them"
         )
-    if settings.fid_weights and "fid" in groups:
-        from agents.cli.main import check_files
-
+    if settings.fid_weights:
         check_files(settings.fid_weights)
 
 
 def run(settings: EvaluateConfig, run: Run) -> None:
     """Sample, measure group by group, tabulate."""
     from agents.evaluation.measure import EvaluationInputs, RealScenes, compute_measure
-    from agents.priors.prior import ScenePrior
-    from scene_envs.files import write_text
     from scene_envs.physics import PhysicsPool
 
     groups = choose_measures(settings.measures, project=settings.project)
-    prior = ScenePrior.load(settings.prior).to(settings.device)
-    results = _Results.of(run, _identity(settings, prior))
+    prior = load_prior(settings)
+    results = _Results(run, _identity(settings, prior))
     missing = [name for name in groups if name not in results.groups]
     real = RealScenes.load(
         prior.scene_type,
@@ -152,11 +143,12 @@ def run(settings: EvaluateConfig, run: Run) -> None:
         seed=settings.seed,
     )
     if len(real.floor) < settings.count:
-        results.note(
+        results.notes.append(
             f"real scenes: {len(real.floor)} in each of the two sets, samples: {settings.count}; distances and "
             "divergences are larger with fewer scenes, so compare them at equal numbers"
         )
-    samples = results.scenes(_SAMPLES, lambda: _sample(prior, settings, None))
+        run.log(results.notes[-1])
+    samples = results.scenes(_SAMPLES, lambda: draw(prior, settings, settings.count, batch_size=settings.batch_size))
     _draw(samples, settings.pictures, run)
     asked = settings.measures.split(",") if isinstance(settings.measures, str) else settings.measures
     optional = "all" in [str(name).strip() for name in asked]
@@ -164,7 +156,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
         inputs = EvaluationInputs(
             samples,
             real,
-            (lambda prompts: results.scenes(_PROMPTED, lambda: _sample(prior, settings, prompts)))
+            (lambda prompts: results.scenes(_PROMPTED, lambda: _prompted(prior, settings, prompts)))
             if prior.conditional
             else None,
             pool,
@@ -179,9 +171,14 @@ def run(settings: EvaluateConfig, run: Run) -> None:
             except (InvalidInputError, MissingDependencyError) as error:
                 if not optional:
                     raise
-                results.skip(name, str(error))
+                results.skipped[name] = str(error)
+                run.log(f"{name} not measured: {error}")
             else:
-                results.add(name, {**_guidance(settings), **figures} if name == "prompts" else figures)
+                if name == "prompts":
+                    claims = {"prompt_claim_guidance": settings.claim_guidance} if settings.claim_guidance else {}
+                    figures = {"prompt_guidance": settings.guidance, **claims, **figures}
+                results.groups[name] = figures
+                results.write()
                 run.log(f"{name} measured in {time.perf_counter() - started:.1f} s")
     report = results.report(groups)
     write_text(run.directory / "metrics.md", report + "\n")
@@ -198,75 +195,58 @@ def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float
         found = dict(json.loads(path.read_text(encoding="utf-8"))).get("evaluation")
         if found is None:
             return {}, {}
-        digest = found.pop("sha256", None)
-        known, groups = dict(found["identity"]), dict(found["groups"])
+        found = without_digest(found, path)
+        return dict(found["identity"]), dict(found["groups"])
     except FileNotFoundError:
         return {}, {}
+    except CorruptFileError as error:
+        raise CorruptFileError(f"{str(error).partition(';')[0]}; remove it to measure anew") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CorruptFileError(f"{str(path)!r} is cut off or damaged; remove it to measure anew") from error
-    if digest is not None and digest != _digest(found):
-        raise CorruptFileError(f"{str(path)!r} was changed after it was written (checksum); remove it to measure anew")
-    return known, groups
-
-
-def _digest(evaluation: dict[str, Any]) -> str:
-    from scene_envs.files import finite
-
-    return hashlib.sha256(json.dumps(finite(evaluation), sort_keys=True).encode()).hexdigest()
 
 
 class _Results:
     """Figures by group, written to ``metrics.json`` after each group, and the samples that they are of.
 
+    Figures in the folder are kept as far as they depend on the same ``identity``.
+
     Args:
         run: the run in whose folder they are.
         identity: the keys, and the digest of the prior, on which the figures depend.
-        groups: figures measured already.
+
+    Raises:
+        InvalidInputError: the figures were measured with other keys; other keys of the prompts are allowed.
     """
 
-    def __init__(self, run: Run, identity: dict[str, Any], groups: dict[str, dict[str, float]]) -> None:
-        self.run_, self.identity, self.groups = run, identity, groups
+    def __init__(self, run: Run, identity: dict[str, Any]) -> None:
+        self.run_, self.identity = run, identity
         self.skipped: dict[str, str] = {}
         self.notes: list[str] = []
-        keys: tuple[str, ...] = ("num_steps", "physics_guidance")
-        self._sampling = {key: float(identity[key]) for key in keys if key in identity}
-
-    @classmethod
-    def of(cls, run: Run, identity: dict[str, Any]) -> _Results:
-        """Go on with the figures in the folder, as far as they depend on the same ``identity``.
-
-        Raises:
-            InvalidInputError: the figures were measured with other keys; other keys of the prompts are allowed.
-        """
+        self._sampling = {key: float(identity[key]) for key in ("num_steps", "physics_guidance")}
         path = run.directory / "metrics.json"
-        known, groups = _read_figures(path)
+        known, self.groups = _read_figures(path)
         changed = {key for key in {*known, *identity} if known.get(key) != identity.get(key)}
-        if known and not changed:
-            return cls(run, identity, groups)
-        stale = [_PROMPTED]
+        if not changed:
+            return
+        stale = [_PROMPTED] if changed & _OF_PROMPTS else []
         if known and changed <= _OF_PROMPTS | {"fid_weights"}:
-            asked = sorted(changed & _OF_PROMPTS)
-            if asked and groups.pop("prompts", None) is not None:
-                run.say(f"{path} has other {' and '.join(asked)}: measuring the prompts anew")
-            stale = [_PROMPTED] if changed & _OF_PROMPTS else []
+            if stale and self.groups.pop("prompts", None) is not None:
+                run.say(f"{path} has other {' and '.join(sorted(changed & _OF_PROMPTS))}: measuring the prompts anew")
             if "fid_weights" in changed:
-                groups.pop("fid", None)
+                self.groups.pop("fid", None)
         elif known and changed != {"digest"}:
-            told = "; ".join(
-                f"{key} was {known.get(key)!r}, is {identity.get(key)!r}" for key in sorted(changed - {"digest"})
-            )
+            told = [f"{key} was {known.get(key)!r}, is {identity.get(key)!r}" for key in sorted(changed - {"digest"})]
             raise InvalidInputError(
-                f"output={str(run.directory)!r} holds figures of other keys ({told[:500]}); give another output"
+                f"output={str(run.directory)!r} holds figures of other keys ({'; '.join(told)[:500]}); give another "
+                "output"
             )
         else:
-            groups, stale = {}, [_SAMPLES, _PROMPTED]
+            self.groups, stale = {}, [_SAMPLES, _PROMPTED]
             if known:
                 run.say(f"{path} is of other weights of this prior: measuring anew")
         for name in stale:
             (run.directory / name).unlink(missing_ok=True)
-        results = cls(run, identity, groups)
-        results.write()
-        return results
+        self.write()
 
     def scenes(self, name: str, draw: Callable[[], SceneBatch]) -> SceneBatch:
         """The scenes in the file ``name``, drawn when it is not there."""
@@ -279,26 +259,11 @@ class _Results:
         batch.save(path)
         return batch
 
-    def add(self, name: str, figures: dict[str, float]) -> None:
-        """Keep the figures of a group."""
-        self.groups[name] = figures
-        self.write()
-
-    def note(self, text: str) -> None:
-        """Say something in the log and under the table."""
-        self.notes.append(text)
-        self.run_.log(text)
-
-    def skip(self, name: str, reason: str) -> None:
-        """Keep the reason why a group was not measured."""
-        self.skipped[name] = reason
-        self.run_.log(f"{name} not measured: {reason}")
-
     def write(self) -> None:
         """``metrics.json``: all figures by name, then the same by group."""
         flat = {name: value for figures in self.groups.values() for name, value in figures.items()}
         evaluation = {"identity": self.identity, "groups": self.groups, "skipped": self.skipped}
-        self.run_.write_metrics({**self._sampling, **flat, "evaluation": {**evaluation, "sha256": _digest(evaluation)}})
+        self.run_.write_metrics({**self._sampling, **flat, "evaluation": with_digest(evaluation)})
 
     def report(self, groups: list[str]) -> str:
         """The figures of ``groups`` as Markdown, and the groups that were not measured."""
@@ -320,41 +285,17 @@ def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
     keys = {key: value for key, value in vars(settings).items() if key not in _NOT_PART}
     keys["physics_guidance"] = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
     if settings.fid_weights:
-        keys["fid_weights"] = _file_digest(Path(settings.fid_weights))
+        keys["fid_weights"] = hashlib.sha256(Path(settings.fid_weights).read_bytes()).hexdigest()[:16]
     return {**keys, "digest": prior_digest(prior)}
 
 
-def _file_digest(path: Path) -> str:
-    """Digest of a file, 16 characters; empty for one that cannot be read."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-    except OSError:
-        return ""
-
-
-def _sample(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str] | None) -> SceneBatch:
-    return prior.sample(
-        settings.count if prompts is None else len(prompts),
-        prompt=prompts,
-        guidance=0.0 if prompts is None else settings.guidance,
-        claim_guidance=0.0 if prompts is None else settings.claim_guidance,
-        physics_guidance=settings.physics_guidance,
-        num_steps=settings.num_steps,
-        seed=settings.seed,
-        batch_size=settings.batch_size,
-    ).to("cpu")
-
-
-def _guidance(settings: EvaluateConfig) -> dict[str, float]:
-    """Figures that say how samples with prompts were guided."""
-    claims = {"prompt_claim_guidance": settings.claim_guidance} if settings.claim_guidance else {}
-    return {"prompt_guidance": settings.guidance, **claims}
+def _prompted(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str]) -> SceneBatch:
+    guidance = {"guidance": settings.guidance, "claim_guidance": settings.claim_guidance}
+    return draw(prior, settings, len(prompts), prompt=prompts, batch_size=settings.batch_size, **guidance)
 
 
 def _draw(samples: SceneBatch, count: int, run: Run) -> None:
     """Draw ``gallery.png``, if the packages for pictures are installed."""
-    from agents.cli.commands.scenes import draw_scenes
-
     if not samples.scene_type.has_geometry:
         run.log(f"no gallery: the assets of {samples.scene_type.name!r} have no geometry here")
         return

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.cli.commands.scenes import make_ready
+from agents.cli.commands.scenes import draw, load_prior, make_ready
+from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 
@@ -34,7 +34,6 @@ class ExportConfig(DrawKeys):
         count: number of scenes; null for all of them, or 16 from a prior.
         project: make the scenes simulation-ready first (project out of penetration, then settle).
         friction: coefficient of friction of all surfaces.
-        seed: seed of the noise, with prior=.
         workers: physics worker processes; 0 computes physics in this process.
         output: folder for assets/ and scene_000/, scene_001/, ...
     """
@@ -45,7 +44,6 @@ class ExportConfig(DrawKeys):
     count: int | None = None
     project: bool = False
     friction: float = 0.6
-    seed: int = 0
     workers: int = 2
     output: str = ""
 
@@ -109,16 +107,10 @@ def export_scenes(
 
 def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
     """The scenes that ``scenes`` or ``prior`` names, at most ``count``."""
-    if settings.prior:
-        from agents.priors.prior import ScenePrior
+    if not settings.prior:
+        from scene_envs.datasets import load_scenes
 
-        prior = ScenePrior.load(settings.prior).to(settings.device)
-        count = 16 if settings.count is None else settings.count
-        batch = prior.sample(
-            count, num_steps=settings.num_steps, physics_guidance=settings.physics_guidance, seed=settings.seed
-        ).to("cpu")
-        batch.save(run.directory / "scenes.safetensors")
-        return batch
-    from scene_envs.datasets import load_scenes
-
-    return load_scenes(Path(settings.scenes), settings.count)
+        return load_scenes(Path(settings.scenes), settings.count)
+    batch = draw(load_prior(settings), settings, 16 if settings.count is None else settings.count)
+    batch.save(run.directory / "scenes.safetensors")
+    return batch

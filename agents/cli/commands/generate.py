@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from agents.cli.run_folder import Run
 from agents.configuration.composition import ProgressKeys, named, require_one_of
-
-if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
 
 
 @dataclass

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
+from agents.cli.commands.scenes import check_files
+from agents.cli.run_folder import Run
 from agents.configuration.composition import DeviceKeys, named
 from scene_envs.errors import InvalidInputError
-
-if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
 
 POSITIONAL = ("checkpoint", "metadata")
 """Words without ``=`` fill these keys, in this order."""
@@ -49,8 +48,6 @@ class ImportCheckpointConfig(DeviceKeys):
 
 def check(settings: ImportCheckpointConfig) -> None:
     """Refuse files that are not there."""
-    from agents.cli.main import check_files
-
     if not settings.checkpoint or not settings.metadata:
         raise InvalidInputError("name the two files: scene-envs import-checkpoint FILE metadata.json")
     check_files(settings.checkpoint, settings.metadata)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from agents.cli.commands.scenes import draw_scenes
-from agents.configuration.composition import DeviceKeys
+from agents.cli.commands.scenes import draw, draw_scenes, load_prior
+from agents.cli.run_folder import Run
+from agents.configuration.composition import DrawKeys, PromptKeys
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
     from agents.priors.prior import ScenePrior
     from scene_envs.scene import SceneBatch
 
@@ -25,7 +25,7 @@ _AT_ONCE = 64
 
 
 @dataclass
-class InpaintingConfig(DeviceKeys):
+class InpaintingConfig(PromptKeys, DrawKeys):
     """Scenes that a prior completes or rearranges.
 
     Attributes:
@@ -33,14 +33,6 @@ class InpaintingConfig(DeviceKeys):
             scenes if it has any), or a dataset; empty takes fresh samples of ``prior``.
         prior: a shipped name, or the folder of a prior or a run; empty means the shipped prior of the scene type.
         count: number of scenes, from the first; null for all, or for 12 fresh samples.
-        prompt: text that the whole scenes should match, for priors that read prompts; null for no prompt.
-        guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
-        claim_guidance: strength with which scenes are guided to the numbers and places that the prompt gives, 0 for
-            none; 2 is a good choice; needs a prompt.
-        physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps, 0
-            to 1; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0 for the others.
-        num_steps: denoising steps per scene.
-        seed: seed of the noise.
         pictures: number of scenes in the galleries; 0 draws none.
         output: folder for scenes.safetensors, before.png and gallery.png.
     """
@@ -48,30 +40,15 @@ class InpaintingConfig(DeviceKeys):
     scenes: str = ""
     prior: str = ""
     count: int | None = None
-    prompt: str | None = None
-    guidance: float = 0.0
-    claim_guidance: float = 0.0
-    physics_guidance: float | None = None
-    num_steps: int = 50
-    seed: int = 0
     pictures: int = 12
     output: str = ""
 
-    def sampling(self, first: int = 0) -> dict[str, Any]:
-        """Arguments of the methods of priors that these keys give, for scenes from number ``first`` on."""
-        return {
-            "prompt": self.prompt,
-            "guidance": self.guidance,
-            "claim_guidance": self.claim_guidance,
-            "physics_guidance": self.physics_guidance,
-            "num_steps": self.num_steps,
-            "seed": self.seed + first,
-        }
-
-    def in_parts(self, batch: SceneBatch, change: Callable[[SceneBatch, dict[str, Any]], SceneBatch]) -> SceneBatch:
-        """The scenes as ``change`` makes them from a part and its arguments; parts bound the memory."""
+    def in_parts(self, batch: SceneBatch, change: Callable[..., SceneBatch], **keys: Any) -> SceneBatch:
+        """The scenes as ``change`` makes them from a part and the keys of sampling; parts bound the memory."""
+        names = ("prompt", "guidance", "claim_guidance", "physics_guidance", "num_steps")
+        keys |= {name: getattr(self, name) for name in names}
         starts = range(0, len(batch), _AT_ONCE)
-        parts = [change(batch[start : start + _AT_ONCE], self.sampling(start)).to("cpu") for start in starts]
+        parts = [change(batch[first : first + _AT_ONCE], seed=self.seed + first, **keys).to("cpu") for first in starts]
         return parts[0].concatenate(parts)
 
 
@@ -83,22 +60,17 @@ def check(settings: InpaintingConfig) -> None:
 
 def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[ScenePrior, SceneBatch]:
     """The prior and the scenes that a command works on."""
-    from agents.priors.prior import ScenePrior
-
     if not settings.scenes:
-        fresh = ScenePrior.load(settings.prior).to(settings.device)
-        count = _FRESH if settings.count is None else settings.count
         from agents.utils.seeds import derived_seed  # with the same noise, a scene would be rearranged into itself
 
-        seed, strength = derived_seed(settings.seed, 1), settings.physics_guidance
-        batch = fresh.sample(count, num_steps=settings.num_steps, seed=seed, physics_guidance=strength)
-        return fresh, batch.to("cpu")
+        prior, count = load_prior(settings), _FRESH if settings.count is None else settings.count
+        return prior, draw(prior, settings, count, seed=derived_seed(settings.seed, 1))
     from scene_envs.datasets import load_scenes
 
     batch = load_scenes(Path(settings.scenes), settings.count)
     if not len(batch):
         raise InvalidInputError(f"{command}: scenes={settings.scenes!r} holds no scene")
-    prior = ScenePrior.load(settings.prior or batch.scene_type.name).to(settings.device)
+    prior = load_prior(replace(settings, prior=settings.prior or batch.scene_type.name))
     if prior.scene_type.name != batch.scene_type.name:
         raise InvalidInputError(
             f"{command}: the prior makes scenes of {prior.scene_type.name!r}, the file holds {batch.scene_type.name!r}"
@@ -131,9 +103,7 @@ class CompleteConfig(InpaintingConfig):
 def run_complete(settings: CompleteConfig, run: Run) -> None:
     """Fill the empty slots."""
     prior, batch = load_prior_and_scenes("complete", settings)
-    filled = settings.in_parts(
-        batch, lambda part, keys: prior.complete(part, slots=settings.slots, fill=settings.fill, **keys)
-    )
+    filled = settings.in_parts(batch, prior.complete, slots=settings.slots, fill=settings.fill)
     added = float((filled.counts - batch.counts).double().mean())
     run.say(f"{len(batch)} scenes, {added:.1f} objects added on average")
     save_scenes(batch, filled, settings.pictures, run, {"added": added})
@@ -142,7 +112,7 @@ def run_complete(settings: CompleteConfig, run: Run) -> None:
 def run_rearrange(settings: InpaintingConfig, run: Run) -> None:
     """Give the free objects new poses; welded objects stay."""
     prior, batch = load_prior_and_scenes("rearrange", settings)
-    moved = settings.in_parts(batch, lambda part, keys: prior.rearrange(part, **keys))
+    moved = settings.in_parts(batch, prior.rearrange)
     distance = (moved.translations - batch.translations).norm(dim=-1)[batch.is_free]
     figures = {"mean_distance_m": float(distance.double().mean()) if len(distance) else 0.0}
     run.say(f"{len(batch)} scenes, objects moved by {figures['mean_distance_m']:.3f} m on average")

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+from agents.configuration.composition import require_one_of
 from scene_envs.errors import InvalidInputError
 
 WRITES = False
@@ -44,8 +45,6 @@ class PackagePriorConfig:
 
 def check(settings: PackagePriorConfig) -> None:
     """Refuse impossible settings before the prior is read."""
-    from agents.configuration.composition import require_one_of
-
     if not settings.prior or not settings.output:
         raise InvalidInputError(
             "package-prior: name the prior and its new folder, as in prior=runs/mine output=priors/mine"

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from agents.cli.run_folder import Run
 from agents.post_training.settings import PostTrainConfig
-
-if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
 
 
 def run(settings: PostTrainConfig, run: Run) -> None:

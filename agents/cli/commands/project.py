@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from agents.cli.commands.scenes import draw_scenes, make_ready
+from agents.cli.run_folder import Run
 from scene_envs.errors import InvalidInputError
-
-if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
 
 
 @dataclass

@@ -7,25 +7,23 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.export import export_scenes
-from agents.cli.commands.scenes import draw_scenes, make_ready, reward_figures
-from agents.configuration.composition import OutputKeys, SamplingKeys, named, require_one_of
+from agents.cli.commands.scenes import draw, draw_scenes, load_prior, make_ready, object_counts, reward_figures
+from agents.cli.run_folder import Run
+from agents.configuration.composition import DrawKeys, OutputKeys, SamplingKeys, named, require_one_of
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
     from scene_envs.scene_types import SceneType
 
 
 @dataclass
-class SampleConfig(SamplingKeys, OutputKeys):
+class SampleConfig(SamplingKeys, DrawKeys, OutputKeys):
     """Scenes from a prior.
 
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
         count: number of scenes to draw.
         eta: scale of the noise of the Gaussian steps: 1 for the ancestral chain, 0 for a deterministic chain (DDIM).
-        physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps, 0
-            to 1; null takes that of the prior, 1 for shipped priors whose names end in _feasible and 0 for the others.
         union: objects in a scene of a prior of several scene types: one_type (only objects of one type) or any.
         reward: reward that scores the samples for metrics.json; null for none.
         reward_timeout: most seconds that a reward from outside this package may take; it runs in its own process.
@@ -39,7 +37,6 @@ class SampleConfig(SamplingKeys, OutputKeys):
     prior: str = "dimsum_table"
     count: int = 16
     eta: float = 1.0
-    physics_guidance: float | None = None
     union: str = "one_type"
     reward: Any = named("feasible_objects", "reward")
     reward_timeout: float = 60.0
@@ -59,7 +56,6 @@ def check(settings: SampleConfig) -> None:
 def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.priors.guidance import physics_strength
-    from agents.priors.prior import ScenePrior
     from rewards.process import close_reward, run_reward
     from scene_envs.export.api import resolve_formats
     from scene_envs.physics import PhysicsPool
@@ -71,34 +67,32 @@ def run(settings: SampleConfig, run: Run) -> None:
         reward = run_reward(
             settings.reward, seed=settings.seed, timeout=settings.reward_timeout, workers=settings.workers
         )
-    prior = ScenePrior.load(settings.prior).to(settings.device).with_union(settings.union)
+    prior = load_prior(settings).with_union(settings.union)
     if not prior.scene_type.has_geometry:
         settings = _without_geometry(settings, prior.scene_type, run)
         reward = None if settings.reward is None else reward
     strength = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
     started = time.perf_counter()
-    batch = prior.sample(
+    batch = draw(
+        prior,
+        settings,
         settings.count,
         prompt=settings.prompt,
         guidance=settings.guidance,
         claim_guidance=settings.claim_guidance,
         physics_guidance=strength,
-        num_steps=settings.num_steps,
         eta=settings.eta,
         slots=settings.slots,
-        seed=settings.seed,
         batch_size=settings.batch_size,
-    ).to("cpu")
+    )
     seconds = time.perf_counter() - started
     guided = f", with physics_guidance={strength:g}" if strength else ""
-    run.say(
-        f"{len(batch)} scenes in {seconds:.1f} s{guided}, {batch.counts.double().mean():.1f} objects each on average"
-    )
+    objects = object_counts(batch)
+    run.say(f"{len(batch)} scenes in {seconds:.1f} s{guided}, {objects['mean']:.1f} objects each on average")
     batch.save(run.directory / "scenes.safetensors")
-    counts = batch.counts
     metrics: dict[str, Any] = {
         "scenes": len(batch),
-        "objects": {"mean": float(counts.double().mean()), "min": int(counts.min()), "max": int(counts.max())},
+        "objects": objects,
         "sampling_seconds": round(seconds, 3),
         "physics_guidance": strength,
     }

@@ -1,15 +1,47 @@
-"""Functions on scenes that several commands share: scoring, making ready, drawing."""
+"""Functions that several commands share: sampling, scoring, making ready, drawing."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.cli.run_folder import Run
+from agents.configuration.composition import DrawKeys
+from scene_envs.errors import InvalidInputError
+from scene_envs.files import is_file
+
 if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
+    from agents.priors.prior import ScenePrior
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 
 _TILE = (400, 300)
+
+
+def check_files(*paths: str) -> None:
+    """Refuse paths at which there is no file."""
+    for path in paths:
+        if not is_file(Path(path)):
+            raise InvalidInputError(f"{path[:200]!r} is no file; name one that is there")
+
+
+def load_prior(settings: Any) -> ScenePrior:
+    """The prior that the keys ``prior`` and ``device`` name."""
+    from agents.priors.prior import ScenePrior
+
+    return ScenePrior.load(settings.prior).to(settings.device)
+
+
+def draw(prior: ScenePrior, settings: DrawKeys, count: int, **keys: Any) -> SceneBatch:
+    """Samples of a prior, on the CPU; ``keys`` are further arguments of its method, or take the place of settings."""
+    own = {"num_steps": settings.num_steps, "physics_guidance": settings.physics_guidance, "seed": settings.seed}
+    return prior.sample(count, **(own | keys)).to("cpu")
+
+
+def object_counts(batch: SceneBatch) -> dict[str, float]:
+    """Mean, least and greatest number of objects of a scene."""
+    counts = batch.counts
+    return {"mean": float(counts.double().mean()), "min": int(counts.min()), "max": int(counts.max())}
 
 
 def reward_figures(reward: Any, batch: SceneBatch, pool: PhysicsPool | None, run: Run) -> dict[str, Any]:

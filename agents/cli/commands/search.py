@@ -8,17 +8,14 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.cli.run_folder import Run
 from agents.configuration.composition import DeviceKeys, ProgressKeys, RewardLimits, composed, named
 from agents.planning.settings import SearchConfig
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from agents.cli.run_folder import Run
     from scene_envs.progress import Progress
-
-FRESH_PRIOR = "dimsum_table"
-"""The prior of a search that starts from fresh samples."""
 
 
 @composed
@@ -53,7 +50,7 @@ def run(settings: SearchKeys, run: Run) -> None:
     search = SearchConfig(**{field.name: getattr(settings, field.name) for field in fields(SearchConfig)})
     limits = {"timeout": settings.reward_timeout, "memory": settings.reward_memory}
     scenes = load_scenes(Path(settings.scenes), settings.count) if settings.scenes else None
-    prior = settings.prior or (FRESH_PRIOR if scenes is None else scenes.scene_type.name)
+    prior = settings.prior or ("dimsum_table" if scenes is None else scenes.scene_type.name)
     objective = settings.objective
     if is_foreign(objective):
         objective = run_reward(objective, seed=settings.seed, workers=settings.workers, **limits)

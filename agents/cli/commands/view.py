@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.cli.commands.scenes import draw, draw_scenes, load_prior, object_counts
+from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys, named
 from scene_envs.errors import InvalidInputError
 from scene_envs.files import find_scenes, is_dataset
 
 if TYPE_CHECKING:
-    from agents.cli.run_folder import Run
     from scene_envs.scene import SceneBatch
 
 
@@ -38,7 +39,6 @@ class ViewConfig(DrawKeys):
     scene: Any = named("", "scene")
     count: int = 16
     first: int = 0
-    seed: int = 0
     title: str | None = None
     pictures: int = 12
     open: bool = False
@@ -59,23 +59,19 @@ def check(settings: ViewConfig) -> None:
 
 def run(settings: ViewConfig, run: Run) -> None:
     """Write the page, and say where it is."""
-    from agents.cli.commands.scenes import draw_scenes
     from scene_envs.render import write_viewer
 
     batch, captions, title = _gather(settings)
     path = write_viewer(batch, run.directory / "viewer.html", captions=captions, title=settings.title or title)
     draw_scenes(batch, settings.pictures, run, "gallery.png")
-    counts = batch.counts
-    run.write_metrics(
-        {
-            "scenes": len(batch),
-            "objects": {"mean": float(counts.double().mean()), "min": int(counts.min()), "max": int(counts.max())},
-            "bytes": path.stat().st_size,
-        }
-    )
-    run.say(f"{len(batch)} scenes, {path.stat().st_size / 1e6:.1f} MB; open in any browser: {path}")
+    size = path.stat().st_size
+    run.write_metrics({"scenes": len(batch), "objects": object_counts(batch), "bytes": size})
+    run.say(f"{len(batch)} scenes, {size / 1e6:.1f} MB; open in any browser: {path}")
     if settings.open:
-        _open(path, run)
+        import webbrowser
+
+        if not webbrowser.open(path.resolve().as_uri()):
+            run.say("no browser was found to open it in")
 
 
 def _gather(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
@@ -83,15 +79,7 @@ def _gather(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
     if settings.scenes:
         return _read(settings)
     if settings.prior:
-        from agents.priors.prior import ScenePrior
-
-        prior = ScenePrior.load(settings.prior).to(settings.device)
-        batch = prior.sample(
-            settings.count,
-            num_steps=settings.num_steps,
-            physics_guidance=settings.physics_guidance,
-            seed=settings.seed,
-        ).to("cpu")
+        batch = draw(load_prior(settings), settings, settings.count)
         return batch, None, f"Samples of {Path(settings.prior).name}"
     import numpy as np
 
@@ -117,10 +105,3 @@ def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
     if len(batch) == 0:
         raise InvalidInputError(f"view: first={settings.first} is beyond the {total} scenes of {str(path)!r}")
     return batch, captions, path.name if path.suffix == ".parquet" or path.is_dir() else str(path.parent.name)
-
-
-def _open(path: Path, run: Run) -> None:
-    import webbrowser
-
-    if not webbrowser.open(path.resolve().as_uri()):
-        run.say("no browser was found to open it in")
