@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -43,7 +44,7 @@ def tea_house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def _ranges_of_a_tenth() -> Iterator[None]:
     """Ranges come from a tenth of the objects, as those of built-in grammars in ``tests/conftest.py``."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scene_envs.datasets.generate._OBJECTS", 1000)
+        patch.setattr(sys.modules["scene_envs.datasets.generate"], "_OBJECTS", 1000)
         yield
 
 
