@@ -226,22 +226,6 @@ def test_a_docstring_over_two_lines_is_one_sentence():
     assert "goes on over two lines." in meanings["text"]
 
 
-@pytest.mark.slow
-def test_wrong_keys_are_told_before_anything_heavy_is_loaded():
-    lines = [
-        ["post-train", "iterations=a"],
-        ["sample", "count=x"],
-        ["search", "budgte=3"],
-        ["pretrain", "optimizer.lr=-1"],
-    ]
-    code = (
-        "import sys; from agents.cli import main\n"
-        f"print([main(line) for line in {lines}], {{'torch', 'matplotlib', 'pybullet'}} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[2, 2, 2, 2] set()"
-
-
 @pytest.mark.parametrize("text", ["${oc.env:HOME}", "a ${b} \\${c}", "${", "$HOME"])
 def test_text_that_looks_like_an_interpolation_is_text(text, echo, tmp_path):
     assert main(["demo", f"text={text}", f"output={tmp_path}"]) == 0
@@ -344,18 +328,26 @@ LINES = {
     "check-reward scene=dimsum_tabel": "did you mean 'dimsum_table'",
     "priors prior=dimsum_tabel": "did you mean 'dimsum_table'",
 }
+WRONG_KEYS = {
+    "post-train iterations=a": "iterations=a is not a whole number",
+    "sample count=x": "count=x is not a whole number",
+    "search budgte=3": "unknown search key 'budgte'",
+    "pretrain optimizer.lr=-1": "lr=-1.0 must be",
+}
 
 
 @pytest.mark.slow
 def test_names_paths_and_numbers_are_refused_without_torch():
     code = (
         "import sys\nfrom agents.cli import main\n"
+        f"assert [main(line.split()) for line in {list(WRONG_KEYS)!r}] == [2] * {len(WRONG_KEYS)}\n"
+        "assert not {'torch', 'matplotlib', 'pybullet'} & set(sys.modules)\n"
         f"for line in {list(LINES)!r}:\n"
         "    assert main(line.split()) == 2, line\n    assert 'torch' not in sys.modules, line"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    for line, told in zip(LINES.values(), done.stderr.splitlines(), strict=True):
+    for line, told in zip((WRONG_KEYS | LINES).values(), done.stderr.splitlines(), strict=True):
         assert line in told
 
 
