@@ -29,7 +29,7 @@ from __future__ import annotations
 import sys
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -75,7 +75,7 @@ class Neon(Algorithm):
 
     def __init__(self, settings: NeonSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         self.settings, self.policy = settings, policy
-        self.prior: Any = policy.prior
+        self.prior = cast(ScenePrior, policy.prior)
         self.own = deepcopy(self.prior)
         self.parameters = [p for p in self.own.parameters() if p.requires_grad]
         self.optimizer = torch.optim.AdamW(self.parameters, weight_decay=0.0)

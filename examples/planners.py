@@ -4,8 +4,8 @@
 
 All keys of ``search`` are accepted; those of the planners are the attributes of the two dataclasses. Neither planner is
 ahead of ``greedy`` at equal numbers of scenes (benchmarks/search.md), so the package has neither. They show how a
-planner uses the :class:`~agents.planning.Ledger` of a plan, which spends the budget and keeps the best state, and how
-one steers the denoising itself.
+planner uses the :class:`~agents.planning.SearchBudget` of a plan, which spends the budget and keeps the best state,
+and how one steers the denoising itself.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from agents.cli import main
-from agents.planning import Ledger, PlannerSettings, PlanResult, Searchable, register_planner
-from agents.planning.ledger import Candidate, Progress, Steered, check_at_least
+from agents.planning import PlannerSettings, PlanResult, Searchable, SearchBudget, register_planner
+from agents.planning.ledger import Candidate, Progress, SteeredProblem, check_at_least
 from scene_envs import SceneBatch
 from scene_envs.errors import InvalidInputError
 
@@ -108,7 +108,7 @@ class UCTPlanner(PlannerSettings):
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions on the tree below the problem's current state."""
-        ledger = Ledger(problem, budget, progress)
+        ledger = SearchBudget(problem, budget, progress)
         root = Node(ledger.root, ledger.actions(ledger.root))
         seen = {ledger.root.fingerprint}
         while ledger.left:
@@ -272,8 +272,8 @@ class TreeOverStepsPlanner(PlannerSettings):
         Raises:
             InvalidInputError: the expansions of ``problem`` cannot be steered.
         """
-        steered = Steered(problem, self.name)
-        ledger = Ledger(steered, budget, progress)
+        steered = SteeredProblem(problem, self.name)
+        ledger = SearchBudget(steered, budget, progress)
         state, actions, best = ledger.root, ledger.actions(ledger.root), None
         tree = Stop(-1)
         while ledger.left and actions:

@@ -1,4 +1,4 @@
-"""Atomic file writes with errors that name the file, and JSON without non-finite numbers."""
+"""Files of the project: atomic writes, JSON and tensors with digests, claimed folders, errors that name the file."""
 
 from __future__ import annotations
 
@@ -21,12 +21,11 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
-
 from scene_envs.errors import CorruptFileError, InvalidInputError, StorageError
 
 if TYPE_CHECKING:
     from jinja2 import Template
+    from torch import Tensor
 
 
 DIGEST = "sha256"

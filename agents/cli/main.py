@@ -21,8 +21,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import torch
-
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import Sources, compose, format_rows, help_text, keys_of
 from agents.configuration.composition import (
@@ -52,7 +50,7 @@ DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
 _SPINS = "3000"
 """Turns that an idle thread of OpenMP waits before it sleeps (``GOMP_SPINCOUNT``)."""
-_MOST_TEXT = 4000
+_MAX_TEXT = 4000
 """Characters of an error message."""
 _USAGE = """\
 usage: scene-envs COMMAND key=value ...
@@ -65,7 +63,7 @@ scene-envs COMMAND --help lists the keys of a command; --traceback shows where a
 --allow-local allows reward=./my_rewards.py:clutter to run that file without a question.
 A command writes into output=FOLDER, by default runs/COMMAND-TIME.
 """
-_LEAST = {
+_MINIMA = {
     "count": 1,
     "num_steps": 1,
     "slots": 1,
@@ -315,11 +313,11 @@ def _at(error: OSError) -> str:
 
 def _cut(error: BaseException) -> str:
     text = str(error)
-    return text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}..."
+    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}..."
 
 
 def _complain(text: str, status: int) -> int:
-    text = text if len(text) <= _MOST_TEXT else f"{text[:_MOST_TEXT]}..."
+    text = text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}..."
     with contextlib.suppress(OSError):  # stderr may be closed
         print(f"scene-envs: {text}".encode(errors="backslashreplace").decode(), file=sys.stderr)
     return status
@@ -407,7 +405,7 @@ def _check_numbers(settings: Any) -> None:
     workers = getattr(settings, "workers", 0)
     if isinstance(workers, int) and workers < 0:
         raise InvalidInputError(f"workers={workers}: give a number of processes, 0 for none")
-    for key, least in {**_LEAST, **getattr(settings, "LEAST", {})}.items():
+    for key, least in {**_MINIMA, **getattr(settings, "LEAST", {})}.items():
         value = getattr(settings, key, None)
         if isinstance(value, int | float) and not least <= value < math.inf:
             may_be_none = any(field.name == key and field.default is None for field in dataclasses.fields(settings))
@@ -485,6 +483,8 @@ def check_device(name: str) -> None:
 
     >>> check_device("cpu")
     """
+    import torch
+
     try:
         device = torch.device(name)
         torch.empty(1, device=device)

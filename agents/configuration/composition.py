@@ -86,8 +86,8 @@ def check_types(kind: type, values: Mapping[str, Any]) -> None:
         value = values[name]
         fits = any(type(value) is one or (one is float and type(value) is int) for one in plain)
         if not fits or (isinstance(value, float) and not math.isfinite(value)):
-            told = " or ".join(sorted("null" if one is NoneType else one.__name__ for one in plain))
-            raise InvalidInputError(f"{name}={str(value)[:100]!r} must be of type {told}")
+            expected = " or ".join(sorted("null" if one is NoneType else one.__name__ for one in plain))
+            raise InvalidInputError(f"{name}={str(value)[:100]!r} must be of type {expected}")
 
 
 # Dataclasses from nested mappings and back

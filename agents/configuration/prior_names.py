@@ -16,7 +16,7 @@ from scene_envs.files import exists, is_file
 SHIPPED = Path(__file__).parents[1] / "priors" / "shipped"
 """Folder of the priors that ship with the package."""
 CONFIG_NAME = "config.json"
-_MOST_NAME = 1000
+_MAX_NAME = 1000
 _JOINT = " with "
 
 
@@ -67,7 +67,7 @@ def list_priors() -> list[str]:
 def find_prior(name: str | os.PathLike[str]) -> Path:
     """The directory of a prior: a shipped name, a prior directory, or a run directory that holds ``prior/``."""
     path = Path(name)
-    if len(str(name)) > _MOST_NAME or "\0" in str(name):
+    if len(str(name)) > _MAX_NAME or "\0" in str(name):
         raise InvalidInputError(
             f"prior={str(name)[:60] + '...'!r} is neither a name nor a path ({len(str(name))} characters)"
         )

@@ -257,8 +257,9 @@ def register_algorithm(
 ) -> Callable[[Algorithm], Algorithm]:
     """Make an algorithm available as ``algorithm=name``; the same name again replaces it.
 
-    The decorated class takes ``(settings, policy, stds)`` and extends :class:`~agents.post_training.algorithms.base.Algorithm` or one
-    of its subclasses, such as :class:`agents.post_training.DDPO`.
+    The decorated class takes ``(settings, policy, stds)`` and extends
+    :class:`~agents.post_training.algorithms.base.Algorithm` or one of its subclasses, such as
+    :class:`agents.post_training.DDPO`.
 
     Args:
         name: name of letters, digits and underscores.

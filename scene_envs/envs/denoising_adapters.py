@@ -135,6 +135,8 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
     `"NextStep"` and `"Disabled"` (with `options={"reset_mask": ...}`) are available. Environment i of a vector
     environment seeded with s plays the same episodes as a single environment seeded with s + i.
     `scene_envs.envs.DenoisingTorchRLEnv` is the torchrl adapter; it agrees with `DenoisingVectorEnv` bit for bit.
+    Post-training samples with its `rollout`, which gives a TensorDict [B, S] of whole episodes. `reset(prompts=[...])`
+    takes one prompt per episode in place of drawn ones.
 
     ## Version History
 

@@ -131,7 +131,7 @@ def test_physics_guidance_guides_all_samples_and_needs_a_folder_of_its_own(
     assert metrics(tmp_path / "out")["physics_guidance"] == 1
     assert "| physics_guidance | 1 |" in (tmp_path / "out" / "metrics.md").read_text()
     assert main(words) == 2
-    assert "physics_guidance was 1.0, is None" in capsys.readouterr().err
+    assert "physics_guidance was 1.0, is 0.0" in capsys.readouterr().err
 
 
 def test_all_leaves_out_what_cannot_be_measured_and_says_why(

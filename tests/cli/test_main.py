@@ -16,7 +16,7 @@ import pytest
 from agents.cli import main
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import describe_fields, keys_of
-from agents.configuration.composition import MEASURE_NAMES, known_masks, known_rewards, known_scenes
+from agents.configuration.composition import MEASURE_NAMES, known_masks, known_rewards
 from agents.pretraining.settings import NETWORKS, registered_networks
 from agents.priors import list_priors
 from rewards import list_rewards
@@ -356,15 +356,15 @@ def test_the_names_that_are_known_without_torch_are_those_of_the_packages():
     assert len(own) > 15
     assert len(list_priors()) > 8
     code = (
-        "from agents.configuration.composition import known_masks, known_rewards\n"
-        "print([known_masks(), known_rewards()])"
+        "from agents.configuration.composition import known_masks, known_rewards, known_scenes\n"
+        "print([known_masks(), known_rewards(), known_scenes()])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    masks, rewards = ast.literal_eval(done.stdout)
+    masks, rewards, scenes = ast.literal_eval(done.stdout)
     assert own <= set(rewards) <= set(list_rewards()) == set(known_rewards())
     assert set(masks) <= set(list_masks()) == set(known_masks())
     assert {"culprits", "explicit", "region"} <= set(masks)
-    assert set(known_scenes()) <= set(list_grammars())
+    assert set(scenes) <= set(list_grammars())
     assert set(NETWORKS) <= set(registered_networks())
 
 

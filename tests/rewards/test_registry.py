@@ -85,7 +85,7 @@ def test_an_unknown_name_offers_the_nearest():
 
 
 def test_a_name_cannot_be_taken_twice_but_a_cell_can_be_run_again():
-    with pytest.raises(InvalidInputError, match=r"'object_count' is taken by rewards\.object_count\.ObjectCount"):
+    with pytest.raises(InvalidInputError, match=r"'object_count' is taken by rewards\.counts\.ObjectCount"):
         register_reward("object_count")(low)
     register_reward("low")(low)
     register_reward("low")(low)
