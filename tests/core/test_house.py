@@ -1,12 +1,17 @@
-"""Import directions of the three packages: no circles, no upward imports, no test helpers in production code."""
+"""Rules of the house: imports point one way, a class is whole in one file, and a short file has a reason."""
 
 from __future__ import annotations
 
+import ast
 import re
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
 
 import pytest
 
-from tests.helpers.import_graph import LAYERS, ROOT, import_graph
+from tests.helpers.import_graph import FILES, LAYERS, ROOT, import_graph
 
 
 def circles(graph: dict[str, set[str]]) -> list[set[str]]:
@@ -99,3 +104,81 @@ def test_what_tests_share_is_in_helpers() -> None:
 def test_every_subpackage_has_a_folder_of_tests() -> None:
     packages = [path.parent.name for top in ("scene_envs", "agents") for path in (ROOT / top).glob("*/__init__.py")]
     assert [name for name in packages if not list((ROOT / "tests" / name).glob("test_*.py"))] == []
+
+
+SHORT = 60
+"""Lines below which a file with a single importer belongs to its importer."""
+LISTED: dict[str, str] = {}
+"""Short files with one importer that stay, and why."""
+
+
+def lines_of(file: Path) -> int:
+    return file.read_text(encoding="utf-8").count("\n")
+
+
+def importers_of(name: str) -> set[str]:
+    """Modules that import a module, but for the surface of its own package, which only passes names on."""
+    package = name.rpartition(".")[0]
+    return {other for other, targets in import_graph().items() if name in targets and other != package}
+
+
+@cache
+def bases() -> dict[tuple[str, str], set[tuple[str, str]]]:
+    """Classes of ours by module and name, and those of ours that they extend."""
+    found = {}
+    for module, file in FILES.items():
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        origin = {
+            alias.asname or alias.name: (node.module or "", alias.name)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                names = [getattr(getattr(base, "value", base), "id", "") for base in node.bases]
+                names += [getattr(base, "id", "") for base in node.bases]
+                found[module, node.name] = {origin.get(name, (module, name)) for name in names if name}
+    return found
+
+
+def test_no_class_has_its_only_subclass_in_another_file_of_its_folder() -> None:
+    subclasses: dict[tuple[str, str], set[tuple[str, str]]] = {}
+    for child, parents in bases().items():
+        for parent in parents & bases().keys():
+            subclasses.setdefault(parent, set()).add(child)
+    split = [
+        f"{'.'.join(parent)} <- {'.'.join(child)}"
+        for parent, (child, *others) in subclasses.items()
+        if not others and parent[0] != child[0] and parent[0].rpartition(".")[0] == child[0].rpartition(".")[0]
+    ]
+    assert split == []
+
+
+def test_a_short_file_with_one_importer_has_a_listed_reason() -> None:
+    short = {
+        name
+        for name, file in FILES.items()
+        if file.name != "__init__.py" and lines_of(file) < SHORT and len(importers_of(name)) == 1
+    }
+    assert short == LISTED.keys()
+
+
+def test_settings_import_no_torch() -> None:
+    settings = [name for name in FILES if name.rpartition(".")[2] == "settings" or ".configuration" in name]
+    assert len(settings) > 3
+    code = (
+        "import sys; from importlib import import_module\n"
+        f"for name in {settings}: import_module(name)\n"
+        "print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_the_house_keeps_its_size() -> None:
+    """At most 210 files and 47,000 lines, 220 lines a file at least on average."""
+    count, lines = len(FILES), sum(map(lines_of, FILES.values()))
+    assert count <= 210
+    assert lines <= 47_000
+    assert lines / count >= 220
