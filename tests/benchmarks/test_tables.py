@@ -4,19 +4,31 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
+from agents.cli.keys import compose
 from agents.configuration.composition import dotted_values
+from agents.post_training.settings import PostTrainConfig
 from agents.pretraining.settings import PretrainConfig
+from agents.pretraining.trainer import Pretrainer
 from benchmarks.paper_tables import ALL_TABLES, Entry, Row, Table, TablesConfig, list_rows, make_tables
+from benchmarks.paper_tables.__main__ import main
 from benchmarks.paper_tables.columns import COLUMNS, Column, error, expand, text
+from benchmarks.paper_tables.data import RowData
 from benchmarks.paper_tables.plot import draw
 from benchmarks.paper_tables.rows import PAPER
+from benchmarks.paper_tables.runner import _alone_in
 from benchmarks.paper_tables.tables import FilledTable, Line, csv_text, markdown, markdown_table
 from benchmarks.paper_tables.training import match_width, run_config, target_parameters
+from benchmarks.post_training.__main__ import main as post_training_main
+from benchmarks.post_training.rows import TABLES
+from benchmarks.post_training.runs import guard_figures, measure, training_figures
+from rewards.registry import resolve_reward
+from scene_envs.datasets import generate
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 STANDARD = dotted_values(PretrainConfig())
@@ -193,3 +205,202 @@ def test_a_column_has_one_meaning() -> None:
         assert set(table.columns) | set(table.plotted) <= known
         assert len(set(table.columns)) == len(table.columns)
     assert all(isinstance(column, Column) and column.name == name for name, column in COLUMNS.items())
+
+
+ROWS = ("flux_mixed", "flux_continuous")
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """Training and held-out scenes."""
+    pytest.importorskip("pybullet")
+    paths = [tmp_path_factory.mktemp(name) for name in ("data", "heldout")]
+    for seed, path in enumerate(paths):
+        generate("dimsum_table", 12, path, seed=seed, workers=0, verify=False, progress=False)
+    return str(paths[0]), str(paths[1])
+
+
+def tables(folders: tuple[str, str], output: Path, *words: str) -> int:
+    data, heldout = folders
+    base = [f"data={data}", f"heldout={heldout}", "tables=[objective]", f"rows=[{','.join(ROWS)}]", "size=tiny"]
+    return main([*base, "count=4", "workers=0", "pretraining={optimizer: {warmup: 2}}", f"output={output}", *words])
+
+
+def records(output: Path) -> list[dict[str, str]]:
+    """Lines of the CSV file without what the clock says."""
+    with (output / "tables.csv").open(encoding="utf-8", newline="") as file:
+        return [{key: value for key, value in row.items() if key != "seconds_per_step"} for row in csv.DictReader(file)]
+
+
+@pytest.fixture(scope="module")
+def whole(folders: tuple[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output of a run that nothing stopped."""
+    output = tmp_path_factory.mktemp("whole")
+    assert tables(folders, output) == 0
+    return output
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_residual_levels")
+def test_it_writes_every_row_and_the_real_scenes(whole: Path) -> None:
+    found = records(whole)
+    assert [row["row"] for row in found] == [*ROWS, ""]
+    assert found[-1]["label"] == "real"
+    assert float(found[-1]["feasible_fraction"]) > 0.9
+    page = (whole / "tables.md").read_text(encoding="utf-8")
+    assert all(f"\n| {row['label']} | " in page for row in found)
+    assert (whole / "plot.png").stat().st_size > 5000
+    first, second = (float(row["parameters"]) for row in found[:2])
+    assert first == pytest.approx(60_000, rel=0.1)
+    assert second == pytest.approx(60_000, rel=0.1)
+    metrics = json.loads((whole / "metrics.json").read_text())
+    assert set(metrics["rows"]) == set(ROWS)
+    assert not metrics["failed"]
+    assert not (whole / "runs" / ROWS[0] / "checkpoint.pt").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_residual_levels")
+def test_killed_and_resumed_it_gives_the_same_tables(
+    folders: tuple[str, str], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    update = Pretrainer._update
+
+    def dies(self: Pretrainer) -> tuple[float, float]:
+        if ROWS[1] in self.config.output and self.step == 2:
+            raise KeyboardInterrupt
+        return update(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Pretrainer, "_update", dies)
+        assert tables(folders, tmp_path) == 130
+    assert not any(row["failure"] for row in records(tmp_path))
+    assert (tmp_path / "tables.md").read_text(encoding="utf-8").count("| not run yet |") == 1
+    steps: list[str] = []
+
+    def counted(self: Pretrainer) -> tuple[float, float]:
+        steps.append(f"{Path(self.config.output).name} {self.step}")
+        return update(self)
+
+    monkeypatch.setattr(Pretrainer, "_update", counted)
+    assert tables(folders, tmp_path) == 0
+    assert steps == [f"{ROWS[1]} 2"]
+    assert records(tmp_path) == records(whole)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_residual_levels")
+def test_a_failing_row_is_told_and_the_rest_goes_on(
+    folders: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    prepare = RowData.prepare
+
+    def fails(self: RowData, config: object) -> object:
+        if ROWS[0] in config.output:  # type: ignore[attr-defined]
+            raise RuntimeError("no room on the device")
+        return prepare(self, config)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(RowData, "prepare", fails)
+    assert tables(folders, tmp_path) == 1
+    assert f"1 of 2 rows failed: {ROWS[0]}" in capsys.readouterr().err
+    bad, good, _ = records(tmp_path)
+    assert bad["failure"] == "RuntimeError: no room on the device"
+    assert not bad["category_kl"]
+    assert float(good["category_kl"]) >= 0
+    assert "failed: RuntimeError: no room on the device" in (tmp_path / "tables.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_residual_levels")
+def test_other_keys_in_the_same_folder_are_refused(
+    folders: tuple[str, str], whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = records(whole)
+    assert tables(folders, whole, "iterations=5") == 2
+    assert "iterations was 3, is 5" in capsys.readouterr().err
+    with _alone_in(whole):
+        assert tables(folders, whole) == 2
+    assert "another command is making tables in" in capsys.readouterr().err
+    assert records(whole) == before
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_residual_levels")
+def test_scenes_of_another_type_are_refused(
+    folders: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert tables(folders, tmp_path, "scene=pantry_shelf") == 2
+    assert "holds scenes of 'dimsum_table', not of scene=pantry_shelf" in capsys.readouterr().err
+    assert tables(folders, tmp_path, "heldout=") == 2
+    assert "too few to compare with; name a folder with more as heldout=" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("table", sorted(TABLES))
+def test_every_kind_of_row_is_a_valid_run(table: str) -> None:
+    names = [row.name for row in TABLES[table].rows]
+    assert len(names) == len(set(names))
+    kinds = {tuple(key for key in row.keys if not key.startswith("seed=")): row for row in TABLES[table].rows}
+    for row in kinds.values():
+        words = [f"prior={row.prior}", *row.keys, f"iterations={row.iterations}"]
+        resolve_reward(compose("post-train", PostTrainConfig, words).reward)
+
+
+def test_the_largest_fall_is_measured_from_the_best_mean_before_it(tmp_path: Path) -> None:
+    means = [0.7, 0.9, 0.8, 0.85, 0.95, 0.94]
+    lines = ["iteration,reward,seconds,guard_ratio"]
+    for window, mean in enumerate(means):
+        for place in range(20):
+            lines.append(f"{20 * window + place + 1},{mean + (0.01 if place % 2 else -0.01)},{window},1.0{window}")
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    figures = training_figures(tmp_path)
+    assert figures["fall"] == pytest.approx(0.1)
+    assert (figures["first"], figures["best"], figures["last"]) == pytest.approx((0.7, 0.95, 0.94))
+    assert figures["loss"] == 1.05
+
+
+def test_the_figures_of_the_guard_are_those_of_its_last_check(tmp_path: Path) -> None:
+    assert guard_figures(tmp_path) == {}
+    sampled = [
+        {"sample_reward": reward, "count_distance": 1.0 + reward, "classifier_accuracy": 0.9 - reward}
+        for reward in (0.5, 0.6, 0.7)
+    ]
+    checks = [{"iteration": 20 * i, "samples": figures} for i, figures in enumerate(sampled[1:], start=1)]
+    guard = {"best_iteration": 20, "base_samples": sampled[0], "checks": checks}
+    (tmp_path / "metrics.json").write_text(json.dumps({"guard": guard}))
+    figures = guard_figures(tmp_path)
+    assert (figures["base_reward"], figures["guard_reward"], figures["kept"]) == (0.5, 0.7, 20.0)
+    assert figures["guard_counts"] == 1.7
+    assert figures["base_classifier"] - figures["guard_classifier"] == pytest.approx(0.2)
+    (tmp_path / "metrics.json").write_text(json.dumps({"guard": None}))
+    assert guard_figures(tmp_path) == {}
+
+
+def test_an_interrupted_evaluation_goes_on_and_a_finished_one_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, calls = tmp_path / "metrics.json", []
+
+    def evaluate(words: tuple[str, ...]) -> int:
+        calls.append(words)
+        groups = {"layout": {"free_objects_mean": 17.0}}
+        path.write_text(
+            json.dumps({"free_objects_mean": 17.0, "evaluation": {"groups": groups, "skipped": {"physics": ""}}})
+        )
+        return 0
+
+    monkeypatch.setattr("benchmarks.post_training.runs.scene_envs", evaluate)
+    path.write_text(json.dumps({"num_steps": 50.0, "evaluation": {"groups": {}, "skipped": {}}}))
+    for _ in range(2):
+        assert measure("dimsum_table", tmp_path, ("layout", "physics"), 8) == {"free_objects_mean": 17.0}
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("word", ["table=placements", "rows=[dimsum-*]"])
+def test_unknown_tables_and_rows_name_the_known_ones(
+    word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert post_training_main([word, f"output={tmp_path}"]) == 2
+    message = capsys.readouterr().err
+    assert word.partition("=")[2].strip("[]") in message
+    assert "placement" in message or "dimsum_table-nft-0" in message

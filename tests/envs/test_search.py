@@ -1,4 +1,4 @@
-"""The search MDP: conformance, seeded trees, masks, Φ, and the planner's interface."""
+"""The search MDP, with one mask and with several: conformance, seeded trees, Φ, and the planner's interface."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlparse
 
 import gymnasium as gym
@@ -16,9 +17,11 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env, data_equivalence
 
+from agents.planning import BeamPlanner, BestOfPlanner, GreedyPlanner, Journal, MCTSPlanner, Session
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardOutput
-from scene_envs.envs import ResetNeededError, SearchEnv
+from scene_envs import check_branchable
+from scene_envs.envs import ResetNeededError, SearchEnv, SearchMaskEnv
 from scene_envs.envs.search import NodeRandomness
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.render import render
@@ -350,3 +353,151 @@ def test_an_episode_that_is_over_at_its_reset_ends_with_the_first_step(prior, fr
 def test_an_objective_that_depends_on_the_batch_is_refused(prior, objective):
     with pytest.raises(InvalidInputError, match="by the other scenes of its batch"):
         SearchEnv(prior=prior, objective=objective, branching=3, num_steps=2)
+
+
+MASK_ID = "scene_envs:SceneEnvs/SearchMask-v0"
+MASKS = ["infeasible", "empty", "random"]
+
+
+def nothing(scene: Any, score: Any, rng: Any) -> torch.Tensor:
+    """A mask that never has a slot."""
+    return torch.zeros_like(scene.is_empty[0])
+
+
+@pytest.fixture
+def mask_kwargs(prior: Any, free_objects: Any) -> dict[str, Any]:
+    return {"prior": prior, "objective": free_objects, "branching": 2, "max_depth": 3, "num_steps": 2, "masks": MASKS}
+
+
+@pytest.fixture
+def mask_env(mask_kwargs: dict[str, Any]) -> SearchMaskEnv:
+    mask_env = SearchMaskEnv(**mask_kwargs)
+    mask_env.reset(seed=0)
+    return mask_env
+
+
+def test_check_env_passes_with_a_choice_of_masks(mask_kwargs: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    blank = lambda batch, highlight: np.zeros((len(batch), 12, 16, 3), np.uint8)  # noqa: E731
+    monkeypatch.setattr("scene_envs.envs.search_gymnasium.picture", blank)
+    monkeypatch.setattr("webbrowser.open", lambda address: True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gym.make(MASK_ID, **mask_kwargs).unwrapped)
+        check_branchable(gym.make(MASK_ID, **mask_kwargs), children=6)
+
+
+def test_two_environments_with_a_choice_of_masks_live_the_same_life(mask_kwargs: dict[str, Any]) -> None:
+    first, second = gym.make(MASK_ID, **mask_kwargs), gym.make(MASK_ID, **mask_kwargs)
+    assert data_equivalence(first.reset(seed=3), second.reset(seed=3), exact=True)
+    for action in (5, 0, 2):
+        a, b = first.step(action), second.step(action)
+        assert data_equivalence(a, b, exact=True)
+    assert a[2:4] == (False, True)  # truncated at max_depth
+
+
+@pytest.mark.parametrize("mask", MASKS)
+def test_with_one_mask_the_tree_is_that_of_the_search(mask_kwargs: dict[str, Any], mask: str) -> None:
+    plain = SearchEnv(**{key: value for key, value in mask_kwargs.items() if key != "masks"}, mask=mask)
+    choice = SearchMaskEnv(**{**mask_kwargs, "masks": [mask]})
+    assert choice.action_space == plain.action_space
+    for mask_env in (plain, choice):
+        mask_env.reset(seed=5)
+    for action in (1, 0):
+        assert plain.step(action)[1:] == choice.step(action)[1:]
+        assert torch.equal(plain.state.scene, choice.state.scene)
+        assert torch.equal(plain.state.mask, choice.state.masks[0])
+
+
+def test_an_action_regenerates_the_slots_of_its_mask(mask_env: SearchMaskEnv) -> None:
+    root = mask_env.clone_state()
+    scene = mask_env.scene(root)
+    odd = torch.arange(34) % 2 == 1
+    assert torch.equal(root.masks[0], scene.is_free[0] & odd)  # what the objective blames
+    assert torch.equal(root.masks[1], scene.is_empty[0])
+    assert not root.masks[:, 0].any()  # the table
+    children = mask_env.expand_batch([(root, action) for action in range(6)])
+    for action, child in enumerate(children):
+        kept = ~root.masks[action // 2]
+        assert torch.equal(child.scene[kept], root.scene[kept])
+        assert not torch.equal(child.scene[~kept], root.scene[~kept])
+    assert not torch.equal(children[0].scene, children[1].scene)
+
+
+def test_observation_and_planner_see_all_masks_before_more_inpaintings(mask_env: SearchMaskEnv) -> None:
+    observation, info = mask_env.reset(seed=1)
+    assert mask_env.observation_space.contains(observation)
+    np.testing.assert_array_equal(observation["regenerate"], mask_env.state.masks.numpy())
+    assert info["regenerate"] == int(mask_env.state.masks.any(dim=0).sum())
+    assert list(mask_env.legal_actions()) == [0, 2, 4, 1, 3, 5]
+    assert mask_env.action_masks().all()
+
+
+def test_masks_without_slots_are_not_legal(mask_kwargs: dict[str, Any]) -> None:
+    mask_env = SearchMaskEnv(**{**mask_kwargs, "masks": [nothing, "random"]})
+    mask_env.reset(seed=0)
+    root = mask_env.state
+    assert mask_env.action_masks().tolist() == [False, False, True, True]
+    with pytest.raises(InvalidInputError, match=r"mask 'nothing' has no slot.*legal actions are \[2, 3\]"):
+        mask_env.expand(root, 0)
+    spent = mask_env.nfe
+    _, reward, terminated, truncated, info = mask_env.step(1)
+    assert (reward, terminated, truncated, info["depth"], mask_env.nfe) == (0.0, False, False, 1, spent)
+    assert torch.equal(mask_env.state.scene, root.scene)
+    assert [mask_env.step(0)[3] for _ in range(2)] == [False, True]  # the depth is spent all the same
+
+
+def test_nothing_in_any_mask_ends_the_episode(mask_kwargs: dict[str, Any]) -> None:
+    mask_env = SearchMaskEnv(**{**mask_kwargs, "masks": ["random", nothing]})
+    mask_env.reset(seed=0)
+    mask_env.problem.mask_generators[0] = nothing
+    assert mask_env.step(0)[2:4] == (True, False)
+    assert not mask_env.action_masks().any()
+
+
+def test_states_with_masks_survive_pickling_and_restoring(mask_env: SearchMaskEnv, mask_kwargs: dict[str, Any]) -> None:
+    mask_env.step(4)
+    state = mask_env.clone_state()
+    after = mask_env.step(1)
+    other = SearchMaskEnv(**mask_kwargs)
+    other.reset(seed=99)
+    other.restore_state(pickle.loads(pickle.dumps(state)))
+    assert other.state == state
+    assert data_equivalence(after[0], other.step(1)[0], exact=True)
+    fewer = SearchMaskEnv(**{**mask_kwargs, "masks": ["random"]})
+    with pytest.raises(InvalidInputError, match="the state has 3 masks, this environment 1"):
+        fewer.reset(options={"state": state})
+    plain = SearchEnv(prior=mask_kwargs["prior"], num_steps=1, objective=mask_kwargs["objective"])
+    plain.reset(seed=0)
+    with pytest.raises(InvalidInputError, match="a MaskChoiceState is needed"):
+        mask_env.restore_state(plain.state)
+
+
+@pytest.mark.parametrize("planner", [BeamPlanner, BestOfPlanner, GreedyPlanner, MCTSPlanner])
+def test_planners_search_it(mask_env: SearchMaskEnv, planner: type, tmp_path: Any) -> None:
+    root = mask_env.clone_state()
+    plan = planner().make(3)
+    (result,) = Session(mask_env, journal=Journal(tmp_path / "journal", {})).run(plan, [root], budget=9)
+    assert 0 < len(result.values) <= 9
+    assert result.best_value == max(result.values)
+    assert {path // 2 for path in result.best_path} <= {0, 1, 2}
+    again = Journal(tmp_path / "journal", {})
+    assert len(again) == len(result.values)
+    spent = mask_env.nfe
+    assert Session(mask_env, journal=again).run(plan, [root], budget=9)[0].values == result.values
+    assert mask_env.nfe == spent  # all came from the journal
+
+
+def test_the_spec_goes_to_json_and_bad_masks_are_named(
+    mask_kwargs: dict[str, Any], prior: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("scene_envs.envs.spaces.resolve_prior", lambda name: prior)
+    masks = ["random", {"name": "empty", "count": 3}]
+    made = gym.make(MASK_ID, objective="object_count", masks=masks, num_steps=2)
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(made.spec.to_json()))
+    assert data_equivalence(made.reset(seed=1), again.reset(seed=1), exact=True)
+    assert made.unwrapped.problem.mask_names == ("random", "empty")
+    with pytest.raises(UnknownNameError, match="did you mean 'random'"):
+        SearchMaskEnv(**{**mask_kwargs, "masks": ["randm"]})
+    for bad in ([], "random", None):
+        with pytest.raises(InvalidInputError, match="give a list of at least one mask"):
+            SearchMaskEnv(**{**mask_kwargs, "masks": bad})

@@ -1,18 +1,32 @@
-"""Breakfast settings: cutlery on its side of the plate, and objects on plates, in bowls and in the crock."""
+"""Breakfast tables: single settings, the scenes of both grammars, and how many objects they have."""
 
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from scene_envs.grammars import Cluster, Gaussian, Grammar, Node, Surface, Yaw
+from scene_envs.grammars import Cluster, Gaussian, Grammar, Node, Surface, Yaw, get_grammar
 from scene_envs.grammars.breakfast import TABLE, crock, facing_pair, place_setting, shared_bowls, shared_plates
 from scene_envs.scene_types import get_scene_type
-from tests.helpers.drawn_scenes import Thing, apart, contents_of, every, things_of
+from tests.helpers.drawn_scenes import (
+    Thing,
+    apart,
+    check_physics,
+    check_reproducible,
+    check_slots,
+    check_support,
+    contents_of,
+    counts,
+    every,
+    things_of,
+)
 
-SCENE_TYPE = get_scene_type("breakfast_table_low_clutter")
+LOW, HIGH = "breakfast_table_low_clutter", "breakfast_table_high_clutter"
+SCENE_TYPE = get_scene_type(LOW)
 FLAT = {"plate": 0.071, "shared_plate": 0.079, "bowl": 0.034}
 """Radius (m) of what is flat and free at the bottom of each, from the page on assets."""
 
@@ -135,3 +149,103 @@ def test_nothing_hangs_over_the_edge() -> None:
             world = corners @ thing.rotation.T + thing.at
             assert np.abs(world[:, 0]).max() < 0.375
             assert np.abs(world[:, 1]).max() < 0.75
+
+
+# -- whole scenes -----------------------------------------------------------------------------------
+
+
+@cache
+def arrays_of(name: str) -> NDArray[np.float32]:
+    return get_grammar(name).sample_array(np.random.default_rng(1), 40)
+
+
+@pytest.fixture(scope="module")
+def low() -> list[list[Thing]]:
+    return things_of(arrays_of(LOW), get_scene_type(LOW))
+
+
+@pytest.fixture(scope="module")
+def high() -> list[list[Thing]]:
+    return things_of(arrays_of(HIGH), get_scene_type(HIGH))
+
+
+@pytest.mark.parametrize("name", [LOW, HIGH])
+def test_slots_are_in_order_and_everything_stands_on_something(name: str) -> None:
+    check_slots(arrays_of(name), get_scene_type(name))
+    for scene in things_of(arrays_of(name), get_scene_type(name)):
+        check_support(scene, get_scene_type(name), levels=(0.0,))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "count", "mean", "deviation", "fewest", "most"),
+    [(LOW, 400, 8.87, 3.8, 4, 26), (HIGH, 150, 20.96, 6.5, 4, 46)],
+)
+def test_counts_follow_the_published_statistics(
+    name: str, count: int, mean: float, deviation: float, fewest: int, most: int
+) -> None:
+    number = counts(get_grammar(name), count)
+    assert number.mean() == pytest.approx(mean, abs=4 * deviation / count**0.5)  # standard errors of the mean
+    assert number.min() >= fewest
+    assert number.min() == fewest or count < 400
+    assert number.max() <= most
+
+
+@pytest.mark.parametrize(("name", "count"), [(LOW, 24), (HIGH, 16)])
+def test_kept_by_physics(name: str, count: int) -> None:
+    check_physics(arrays_of(name)[:count], get_scene_type(name))
+
+
+@pytest.mark.parametrize("name", [LOW, HIGH])
+def test_the_same_seed_gives_the_same_scenes_and_another_gives_others(name: str) -> None:
+    check_reproducible(name)
+
+
+def test_at_most_two_places_opposite_each_other_and_one_crock(low: list[list[Thing]]) -> None:
+    for scene in low:
+        plates = [thing for thing in scene if thing.name == "plate"]
+        assert len(plates) <= 2
+        if len(plates) == 2:
+            assert sorted(np.sign(plate.at[0]) for plate in plates) == [-1, 1]
+            assert abs(plates[0].at[1] - plates[1].at[1]) < 0.07
+        assert sum(thing.name == "utensil_crock" for thing in scene) <= 1
+        assert sum(thing.name == "shared_plate" for thing in scene) <= 2
+        assert sum(thing.name == "cereal_box" for thing in scene) <= 3
+        assert sum(thing.name == "water_jug" for thing in scene) <= 2
+
+
+def test_cutlery_on_the_table_lies_beside_a_place_and_the_rest_is_in_the_crock(low: list[list[Thing]]) -> None:
+    for scene in low:
+        jars = [thing for thing in scene if thing.name == "utensil_crock"]
+        standing = {id(tool) for jar in jars for tool in contents_of(jar, scene, SCENE_TYPE)}
+        places = [thing for thing in scene if thing.name in ("plate", "bowl") and thing.at[2] == 0]
+        for tool in scene:
+            if tool.name in ("fork", "knife", "dinner_spoon", "teaspoon") and id(tool) not in standing:
+                assert tool.at[2] == 0
+                assert min(apart(tool, place) for place in places) < 0.17
+
+
+def test_up_to_three_places_along_each_side(high: list[list[Thing]]) -> None:
+    for scene in high:
+        for side in (-1.0, 1.0):
+            along = sorted(thing.at[1] for thing in scene if thing.name == "plate" and thing.at[0] * side > 0)
+            assert len(along) <= 3
+            assert (np.diff(along) > 0.23).all()
+        assert all(0.16 < abs(thing.at[0]) < 0.24 for thing in scene if thing.name == "plate")
+        assert sum(thing.name == "shared_plate" for thing in scene) <= 4
+        assert sum(thing.name == "bowl" for thing in scene) <= 12
+        assert sum(thing.name == "cereal_box" for thing in scene) <= 3
+        assert sum(thing.name == "water_jug" for thing in scene) <= 2
+        assert sum(thing.name == "mug" for thing in scene) <= sum(thing.name == "plate" for thing in scene)
+
+
+def test_each_fork_is_left_and_each_knife_right_of_a_plate(high: list[list[Thing]]) -> None:
+    # Who sits at x < 0 looks along +x and has the left hand toward +y; the other side is the mirror of it.
+    for scene in high:
+        plates = [thing for thing in scene if thing.name == "plate"]
+        for tool in (thing for thing in scene if thing.name in ("fork", "knife")):
+            toward_left = -np.sign(tool.at[0]) * (1.0 if tool.name == "fork" else -1.0)
+            assert any(
+                0.11 < toward_left * (tool.at[1] - plate.at[1]) < 0.16 and abs(tool.at[0] - plate.at[0]) < 0.03
+                for plate in plates
+            )

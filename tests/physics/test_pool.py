@@ -1,4 +1,4 @@
-"""The pool: same results for any number of workers, and nothing lost with a worker."""
+"""The pool, with processes and on Ray: same results for any number of workers, and nothing lost with a worker."""
 
 from __future__ import annotations
 
@@ -6,15 +6,27 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from rewards.feasible import forget_verdicts
+from scene_envs.envs.scoring import RewardScorer
 from scene_envs.errors import InvalidInputError, PhysicsError
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import FeasibilityResult, PhysicsPool, feasibility, penetration, project, settle
+from scene_envs.physics import (
+    FeasibilityResult,
+    PhysicsPool,
+    RayPhysicsPool,
+    feasibility,
+    make_pool,
+    penetration,
+    project,
+    settle,
+)
 from scene_envs.scene import SceneBatch
 from tests.helpers.forked import forked_workers
 from tests.helpers.simple_scenes import scene
@@ -156,3 +168,106 @@ def test_a_worker_computes_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("scene_envs.workers.Process", lambda *_, **options: given.append(options))
     PhysicsPool(workers=1)._make()
     assert given[0]["environment"]["OMP_NUM_THREADS"] == "1"
+
+
+@pytest.fixture(scope="module")
+def few() -> SceneBatch:
+    clean = get_grammar("dimsum_table").sample(np.random.default_rng(11), 12)
+    noise = 0.004 * torch.randn(clean.translations.shape, generator=torch.Generator().manual_seed(0))
+    return clean.with_poses(clean.translations + noise * clean.is_free.unsqueeze(-1), clean.rotations)
+
+
+@pytest.fixture(scope="module")
+def ray_pool() -> Iterator[PhysicsPool]:
+    pytest.importorskip("ray")
+    with make_pool("ray") as ray_pool:
+        yield ray_pool
+
+
+@pytest.fixture
+def shared_ray_pool(ray_pool: PhysicsPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What asks for workers on Ray gets those of ``ray_pool`` and leaves them running: each takes seconds to start."""
+    monkeypatch.setattr(
+        "scene_envs.physics.make_pool",
+        lambda workers, *timeout: ray_pool if workers == "ray" else make_pool(workers, *timeout),
+    )
+    monkeypatch.setattr(ray_pool, "close", lambda: None)
+
+
+@pytest.mark.slow
+def test_results_are_those_of_this_process_bit_for_bit_and_in_order(few: SceneBatch, ray_pool: PhysicsPool) -> None:
+    found, expected = feasibility(few, pool=ray_pool), feasibility(few)
+    assert all(torch.equal(getattr(found, name), getattr(expected, name)) for name in FIELDS)
+    assert isinstance(ray_pool, RayPhysicsPool)
+    assert os.getpid() not in ray_pool.process_ids
+    assert 1 <= len(ray_pool.process_ids) <= ray_pool.workers
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_costs_nothing(few: SceneBatch, ray_pool: PhysicsPool) -> None:
+    feasibility(few, pool=ray_pool)
+    victim = ray_pool.process_ids[0]
+    killer = threading.Timer(0.05, os.kill, (victim, signal.SIGKILL))
+    killer.start()
+    large = SceneBatch.concatenate([few] * 4)
+    result = feasibility(large, pool=ray_pool)
+    killer.join()
+    again = feasibility(few, pool=ray_pool)
+    assert bool(result.valid.all())
+    assert torch.equal(result.displacement, again.displacement.repeat(4, 1))
+    assert victim not in ray_pool.process_ids
+
+
+@pytest.mark.slow
+def test_scenes_that_take_too_long_twice_are_invalid(
+    few: SceneBatch, ray_pool: PhysicsPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    feasibility(few[:1], pool=ray_pool)  # a worker is up
+    with monkeypatch.context() as patch:
+        patch.setattr(ray_pool, "timeout", 1e-4)
+        assert feasibility(few[:2], pool=ray_pool).valid.tolist() == [False, False]
+    assert feasibility(few[:2], pool=ray_pool).valid.tolist() == [True, True]  # the pool stays usable
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("shared_ray_pool")
+def test_a_reward_is_scored_on_ray_and_kept_by_content(few: SceneBatch, monkeypatch: pytest.MonkeyPatch) -> None:
+    forget_verdicts()
+    scorer = RewardScorer("feasible_objects", workers="ray")
+    few = few[:4]
+    first = scorer(few)
+    with monkeypatch.context() as patch:
+        patch.setattr(PhysicsPool, "run", None)  # nothing is simulated a second time
+        assert torch.equal(scorer(few).value, first.value)
+    scorer.close()
+    assert first.value.tolist() == feasibility_counts(few)
+
+
+def feasibility_counts(few: SceneBatch) -> list[float]:
+    forget_verdicts()
+    return RewardScorer("feasible_objects")(few).value.tolist()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("shared_ray_pool")
+def test_a_run_on_ray_is_the_run_in_this_process(tmp_path: Path) -> None:
+    from agents.post_training import PostTrainConfig, post_train
+    from agents.priors.testing import tiny_prior
+
+    logs = []
+    for workers in ("ray", 0):
+        forget_verdicts()
+        config = PostTrainConfig(
+            output=str(tmp_path / str(workers)), iterations=1, batch_size=4, num_steps=4, workers=workers,
+            reward="feasible_objects", algorithm={"gradient_steps": 2}, guard={"scenes": 8, "samples": 0},
+            regularisation={"bank_size": 20, "batch_size": 4}, progress="none",
+        )  # fmt: skip
+        logs.append([{**row, "seconds": 0.0} for row in post_train(config, prior=tiny_prior()).history])
+    assert logs[0] == logs[1]
+
+
+@pytest.mark.slow
+def test_other_words_are_refused() -> None:
+    for make in (make_pool, lambda workers: RewardScorer("object_count", workers)):
+        with pytest.raises(InvalidInputError, match="or ray for a Ray cluster"):
+            make("dask")

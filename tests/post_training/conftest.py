@@ -18,7 +18,7 @@ _DRAWN: dict[tuple[Any, ...], SceneBatch] = {}
 @pytest.fixture(autouse=True)
 def _blank_curves(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of runs are blank, but for the one file that looks at them."""
-    if request.module.__name__.rpartition(".")[2] == "test_post_training_reports":
+    if request.module.__name__.rpartition(".")[2] == "test_report":
         return
     request.getfixturevalue("blank_curves")
     monkeypatch.setattr("agents.post_training.trainer.draw_curve", _blank)

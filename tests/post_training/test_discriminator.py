@@ -59,7 +59,7 @@ def test_value_is_the_mean_of_its_credit(trained: Discriminator) -> None:
 
 def test_furniture_of_rooms_is_judged_and_does_not_change_the_value() -> None:
     grammar = get_grammar("restaurant_low_clutter")
-    real, samples = (grammar.sample(np.random.default_rng(seed), 24) for seed in (0, 1))
+    real, samples = (grammar.sample(np.random.default_rng(seed), 12) for seed in (0, 1))
     shift = torch.tensor([0.0, 0.0, 0.3]) * samples.is_furniture[..., None]
     reward = Discriminator()
     reward.begin(real, seed=0)
@@ -112,6 +112,7 @@ def test_learning_needs_real_scenes() -> None:
         Discriminator().learn(SceneBatch.empty("dimsum_table", 1))
 
 
+@pytest.mark.usefixtures("copied_workers")
 def test_a_composite_with_foreign_parts_is_refused(tmp_path: Path) -> None:
     foreign = tmp_path / "mine.py"
     allow_local_rewards(foreign)
@@ -132,9 +133,9 @@ def test_a_resumed_run_equals_one_without_a_break(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(learned_rewards, "FIRST_STEPS", 5)
     reward = {"name": "clip", "reward": "discriminator", "high": 0.9}
     prior = tiny_prior(process="mixed")
-    whole = post_train(small_config(tmp_path / "whole", reward=reward, iterations=4), prior=prior)
+    whole = post_train(small_config(tmp_path / "whole", reward=reward, iterations=3), prior=prior)
     post_train(small_config(tmp_path / "parts", reward=reward, iterations=2), prior=prior)
-    parts = post_train(small_config(tmp_path / "parts", reward=reward, iterations=4), prior=prior)
+    parts = post_train(small_config(tmp_path / "parts", reward=reward, iterations=3), prior=prior)
     rewards = [[row["reward"] for row in result.history] for result in (whole, parts)]
     assert rewards[0] == rewards[1]
     assert len(set(rewards[0])) > 1

@@ -1,26 +1,35 @@
-"""Pretraining: exact resume, learning-rate curve, and what happens when things go wrong."""
+"""Pretraining: exact resume, learning-rate curve, warm-up of text, and what happens when things go wrong."""
 
 from __future__ import annotations
 
+import copy
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from agents.cli import main
 from agents.configuration.composition import changed
+from agents.configuration.composition import changed as changed_config
 from agents.pretraining.initial_prior import SceneTable, build_prior, prepare
 from agents.pretraining.settings import PretrainConfig
-from agents.pretraining.trainer import Pretrainer, learning_rate_at
+from agents.pretraining.trainer import Pretrainer, learning_rate_at, warm_up_text
+from agents.priors.mixed import MixedPrior
+from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import WeightAverage
 from scene_envs.datasets import generate
+from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
+from scene_envs.grammars import get_grammar
 from scene_envs.normalizer import Normalizer
+from scene_envs.scene import SceneBatch
 from tests.helpers.small_pretraining import make_run
 
 pytestmark = pytest.mark.usefixtures("few_residual_levels")
@@ -318,3 +327,158 @@ def test_averages_of_a_checkpoint_go_to_the_device_of_the_present_ones() -> None
     average.restore(saved.tensors, updates=3)
     assert {tensor.device.type for tensor in average.tensors.values()} == {"meta"}
     assert average.updates == 3
+
+
+@pytest.mark.slow
+def test_a_gradient_that_is_not_finite_is_not_applied(config: PretrainConfig, raw: torch.Tensor) -> None:
+    run = make_run(config, raw)
+    clip = torch.nn.utils.clip_grad_norm_
+
+    def poisoned(parameters: Any, *arguments: Any) -> torch.Tensor:
+        parameters = list(parameters)
+        if run.step == 3:
+            parameters[0].grad.fill_(torch.nan)
+        return clip(parameters, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.nn.utils, "clip_grad_norm_", poisoned)
+        with pytest.raises(TrainingError, match=r"the gradient norm became nan at step 3.*give another output"):
+            run.run()
+    assert all(bool(tensor.isfinite().all()) for tensor in run.network.state_dict().values())
+    assert make_run(config, raw).run().card["trained_steps"] == 6
+
+
+@pytest.mark.slow
+def test_a_run_does_not_go_on_with_other_data(config: PretrainConfig, raw: torch.Tensor) -> None:
+    make_run(replace(config, iterations=2), raw).run()
+    others = raw.clone()
+    others[:, 1:, 0] += 0.2
+    with pytest.raises(InvalidInputError, match="was started with other scenes"):
+        make_run(config, others).run()
+    with pytest.raises(InvalidInputError, match="was started with other scenes"):
+        make_run(config, raw[:60]).run()
+    assert make_run(config, raw).run().card["trained_steps"] == 6
+
+
+@pytest.mark.slow
+def test_a_prior_trained_further_keeps_its_origin_and_licence(config: PretrainConfig, raw: torch.Tensor) -> None:
+    older = tiny_prior()
+    older.card = {
+        "imported_from": "authors.ckpt", "license": "CC BY-NC", "trained_steps": 100_000, "measures": {"scenes": 2.0},
+        "limits": "None.",
+    }  # fmt: skip
+    path = older.save(config.directory / "older")
+    run = replace(config, prior=str(path), output=str(config.directory / "run"), iterations=1)
+    prior = ScenePrior.load(path)
+    scenes = prior.encode(SceneBatch(raw, prior.scene_type))
+    card = Pretrainer(run, SceneTable(scenes[:56]), scenes[56:], prior).run().card
+    assert card["license"] == "CC BY-NC"
+    assert card["imported_from"] == "authors.ckpt"
+    assert card["base"] == {"name": "older", "trained_steps": 100_000}
+    assert card["trained_steps"] == 1
+    assert not {"measures", "limits"} & card.keys()
+
+
+def test_the_error_that_is_left_is_measured_on_scenes_of_every_part(
+    config: PretrainConfig, raw: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(replace(config, iterations=0), raw)
+    monkeypatch.setattr("agents.pretraining.trainer._RESIDUAL", 3)
+    seen: list[torch.Tensor] = []
+    monkeypatch.setattr(type(run.prior), "fit_residual", lambda self, x0: seen.append(x0))
+    run.run()
+    assert torch.equal(seen[0], run.heldout_data[[0, 3, 7]])
+
+
+@pytest.mark.slow
+def test_datasets_of_another_scene_type_are_named(tmp_path: Path) -> None:
+    for scene in ("dimsum_table", "pantry_shelf"):
+        generate(scene, 4, tmp_path / scene, workers=0, verify=False, progress=False)
+    dimsum, pantry = str(tmp_path / "dimsum_table"), str(tmp_path / "pantry_shelf")
+    with pytest.raises(InvalidInputError, match=r"holds scenes of 'pantry_shelf', and scene=dimsum_table"):
+        prepare(PretrainConfig(data=pantry))
+    with pytest.raises(InvalidInputError, match=r"heldout=.* holds scenes of 'pantry_shelf'"):
+        prepare(PretrainConfig(data=dimsum, heldout=pantry))
+
+
+@pytest.mark.slow
+def test_a_run_of_no_steps_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    generate("dimsum_table", 4, tmp_path / "data", workers=0, verify=False, progress=False)
+    small = ["network.hidden=16", "network.depth=1", "network.heads=1", "iterations=0"]
+    assert main(["pretrain", f"data={tmp_path / 'data'}", *small, f"output={tmp_path / 'run'}"]) == 0
+    assert "0 steps" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        ({"process": {"noise": {"ceiling": float("inf")}}}, "ceiling=inf must be a finite number"),
+        ({"loss": {"noise": {"mean": 500.0}}}, "lie outside the schedule"),
+    ],
+)
+def test_noise_levels_outside_the_schedule_are_refused(
+    config: PretrainConfig, raw: torch.Tensor, keys: dict[str, Any], told: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=told):
+        make_run(PretrainConfig(output=config.output, network=config.network, iterations=1, **keys), raw)._update()
+
+
+def fresh(count: int = 24, **keys: object) -> tuple[MixedPrior, SceneTable]:
+    """A prior without training, and ``count`` scenes with prompts."""
+    scenes = get_grammar("living_room_shelf").sample(np.random.default_rng(0), count)
+    prompts = describe_all(scenes, np.random.default_rng(0))
+    text = {"encoder": "vocabulary", "vocabulary": {"width": 48, "depth": 1, "latents": 2}}
+    small = PretrainConfig(scene="living_room_shelf", text=text, network={"hidden": 32, "depth": 2, "heads": 2})
+    config = changed_config(small, keys)
+    prior = build_prior(config, scenes.tensor, Normalizer.fit(scenes.tensor), prompts)
+    assert isinstance(prior, MixedPrior)
+    return prior, SceneTable(prior.encode(scenes), prompts)
+
+
+def read_numbers(prior: MixedPrior, prompt: str) -> torch.Tensor:
+    """The likeliest number of each kind of object, and of all objects."""
+    conditioning = prior.denoiser.network.count_conditioning
+    with torch.no_grad():
+        return conditioning.count_logits(prior.encode_prompts([prompt])[0][:, : conditioning.things]).argmax(dim=-1)[0]  # type: ignore[no-any-return]
+
+
+@pytest.mark.slow
+def test_numbers_of_objects_are_read_from_prompts() -> None:
+    prior, data = fresh(count=96)
+    assert warm_up_text(prior, data, 250, 16, seed=0) is not None
+    assert [int(read_numbers(prior, f"A scene with {n} objects.")[-1]) for n in (4, 6, 8)] == [4, 6, 8]
+    kinds = list(dict.fromkeys(asset.display_name for asset in prior.scene_type.library))
+    games = [
+        int(read_numbers(prior, f"A scene with {what}.")[kinds.index("board game")])
+        for what in ("a board game", "two board games")
+    ]
+    assert games == [1, 2]
+
+
+def test_assets_of_one_name_are_one_kind_to_a_prompt() -> None:
+    prior, _ = fresh()
+    names = [asset.display_name for asset in prior.scene_type.library]
+    assert len(set(names)) < len(names)
+    assert prior.denoiser.network.count_conditioning.things == len(set(names)) + 1
+
+
+def test_the_same_seed_learns_the_same_and_nothing_else_changes() -> None:
+    prior, data = fresh()
+    priors = [prior, copy.deepcopy(prior)]
+    before = {name: value.clone() for name, value in priors[0].denoiser.state_dict().items()}
+    for prior in priors:
+        warm_up_text(prior, data, 3, 16, seed=5)
+    states = [prior.denoiser.state_dict() for prior in priors]
+    changed = {name for name in before if not torch.equal(states[0][name], before[name])}
+    assert all(torch.equal(states[0][name], states[1][name]) for name in before)
+    assert changed
+    assert all(name.startswith(("text_encoder.", "network.count_conditioning.counts_out.")) for name in changed)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [{"text.vocabulary.count_conditioning": False}, {"network.name": "midiffusion", "process.empty_slots": "attended"}],
+)
+def test_a_network_without_count_conditioning_has_nothing_to_learn(keys: dict[str, object]) -> None:
+    prior, data = fresh(**keys)
+    assert warm_up_text(prior, data, 3, 16, seed=0) is None

@@ -1,4 +1,4 @@
-"""The page of the viewer: what is embedded, and what a browser makes of it."""
+"""The page of the viewer and the command: what is embedded, and what a browser makes of it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 import torch
 
+from agents.cli import main
+from agents.priors.testing import tiny_prior
+from scene_envs.datasets import SceneDataset
 from scene_envs.errors import InvalidInputError
+from scene_envs.normalizer import Normalizer
 from scene_envs.render import write_viewer
 from scene_envs.render.stage import get_stage
 from scene_envs.rotations import matrix_to_quaternion, yaw_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, get_scene_type
-
-pytestmark = pytest.mark.slow
 
 DIMSUM = get_scene_type("dimsum_table")
 
@@ -50,6 +52,7 @@ def array(text, dtype, columns=None):
 # -- the file ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_one_file_that_asks_for_nothing_else(tmp_path):
     path = write_viewer(scenes(), tmp_path / "new" / "viewer.html")
     page = path.read_text()
@@ -61,6 +64,7 @@ def test_one_file_that_asks_for_nothing_else(tmp_path):
     assert path.stat().st_size < 1_000_000
 
 
+@pytest.mark.slow
 def test_poses_and_meshes_are_embedded_as_they_are(tmp_path):
     batch = scenes()
     data = embedded(write_viewer(batch, tmp_path / "viewer.html"))
@@ -85,11 +89,13 @@ def test_poses_and_meshes_are_embedded_as_they_are(tmp_path):
         assert asset["welded"] == (asset["name"] == "cafe_table")
 
 
+@pytest.mark.slow
 def test_more_scenes_cost_poses_only(tmp_path):
     one, many = (write_viewer(scenes(3)[[2] * n], tmp_path / f"{n}.html").stat().st_size for n in (1, 101))
     assert (many - one) / 100 < 500  # bytes; 5 objects of 32 bytes each, in base64, and a caption
 
 
+@pytest.mark.slow
 def test_titles_and_captions_cannot_break_the_page(tmp_path):
     nasty = "</script><script>alert(1)</script> & @@DATA@@ \u2028"
     path = write_viewer(scenes(1), tmp_path / "viewer.html", captions=[nasty], title=nasty)
@@ -98,6 +104,7 @@ def test_titles_and_captions_cannot_break_the_page(tmp_path):
     assert html.escape(nasty) in path.read_text()
 
 
+@pytest.mark.slow
 def test_wrong_arguments_are_named(tmp_path):
     with pytest.raises(InvalidInputError, match="at least one scene"):
         write_viewer(SceneBatch.empty(DIMSUM, 0), tmp_path / "viewer.html")
@@ -126,6 +133,7 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
 """What a page is answered where a browser has no WebGL."""
 
 
+@pytest.mark.slow
 def test_a_browser_draws_the_objects_where_they_are(browser, tmp_path):
     """Against the pinhole camera, and pixel by pixel against the software renderer."""
     pytest.importorskip("pybullet")
@@ -162,6 +170,7 @@ def test_a_browser_draws_the_objects_where_they_are(browser, tmp_path):
     np.testing.assert_allclose([x / pixels + 0.5, y / pixels + 0.5], expected, atol=2.5)
 
 
+@pytest.mark.slow
 def test_the_screen_shows_a_shaded_picture_and_the_whole_table(browser, tmp_path):
     from PIL import Image
 
@@ -181,6 +190,7 @@ def test_the_screen_shows_a_shaded_picture_and_the_whole_table(browser, tmp_path
     assert wood[0] > wood[1] > wood[2]  # brown
 
 
+@pytest.mark.slow
 def test_a_page_that_is_still_written_shows_its_last_scene_to_who_looks_there(coarse_browser, tmp_path):
     browser = coarse_browser
     page = write_viewer(scenes(2), tmp_path / "viewer.html", refresh=3600.0)
@@ -194,6 +204,7 @@ def test_a_page_that_is_still_written_shows_its_last_scene_to_who_looks_there(co
         assert browser.shown()["scene"] == shown
 
 
+@pytest.mark.slow
 def test_keys_and_the_list_change_what_is_drawn(coarse_browser, tmp_path):
     browser = coarse_browser
     browser.open(write_viewer(scenes(3), tmp_path / "viewer.html"))
@@ -221,6 +232,7 @@ def test_keys_and_the_list_change_what_is_drawn(coarse_browser, tmp_path):
     browser.wait_for("location.hash.includes('scene=1')")
 
 
+@pytest.mark.slow
 def test_mouse_and_touch_move_the_camera_and_choose_objects(coarse_browser, tmp_path):
     browser = coarse_browser
     browser.open(write_viewer(scenes(1), tmp_path / "viewer.html"), "#azimuth=0&elevation=60&distance=3&target=0,0,0")
@@ -260,6 +272,7 @@ def test_mouse_and_touch_move_the_camera_and_choose_objects(coarse_browser, tmp_
     assert (shown["selected"], shown["errors"]) == ("", "0")
 
 
+@pytest.mark.slow
 def test_without_webgl_the_scene_is_listed(coarse_browser, tmp_path):
     browser = coarse_browser
     browser.send("Page.enable")
@@ -277,3 +290,110 @@ def test_without_webgl_the_scene_is_listed(coarse_browser, tmp_path):
     assert cells[:3] == ["table", "0", "0.0000, 0.0000, 0.0000"]
     assert cells[4:8] == ["teapot", "3", "0.1000, -0.3500, 0.0000", "0.0, 0.0, 40.1"]
     assert cells[8:12] == ["plate", "4", "0.0000, 0.3000, 0.2000", "53.1, 0.0, 0.0"]
+
+
+BATCH = SceneBatch.empty("dimsum_table", 5, slots=4)
+
+
+@pytest.fixture
+def samples(tmp_path):
+    """A run's folder with five scenes; scene k has its table k cm up."""
+    translations = BATCH.translations.clone()
+    translations[:, 0, 2] = torch.arange(5) * 0.01
+    batch = BATCH.with_poses(translations, BATCH.rotations)
+    batch.save(tmp_path / "run" / "scenes.safetensors")
+    return tmp_path / "run"
+
+
+def page(folder):
+    text = (folder / "viewer.html").read_text()
+    return re.search("<title>(.*?)</title>", text)[1], json.loads(
+        re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1]
+    )
+
+
+def view(*words):
+    return main(["view", "pictures=0", *map(str, words)])
+
+
+def test_a_scene_file_and_the_folder_of_its_run(samples, tmp_path, capsys):
+    assert view(f"scenes={samples / 'scenes.safetensors'}", f"output={tmp_path / 'a'}") == 0
+    assert str(tmp_path / "a" / "viewer.html") in capsys.readouterr().out
+    title, data = page(tmp_path / "a")
+    assert (title, len(data["scenes"])) == ("run", 5)
+    assert view(f"scenes={samples}", "first=2", "count=2", "title=Mine", f"output={tmp_path / 'b'}") == 0
+    title, part = page(tmp_path / "b")
+    assert title == "Mine"
+    assert part["scenes"] == data["scenes"][2:4]
+    assert json.loads((tmp_path / "b" / "metrics.json").read_text())["scenes"] == 2
+
+
+def test_what_was_made_ready_is_shown_rather_than_what_it_was_made_of(samples, tmp_path):
+    BATCH[:1].save(samples / "ready.safetensors")
+    assert view(f"scenes={samples}", f"output={tmp_path / 'out'}") == 0
+    assert len(page(tmp_path / "out")[1]["scenes"]) == 1
+
+
+def test_a_dataset_with_its_prompts_as_captions(tmp_path):
+    prompts = [f"A scene with {k} objects." for k in range(5)]
+    dataset = SceneDataset(BATCH.tensor, prompts, Normalizer.fit(BATCH.tensor), BATCH.scene_type)
+    dataset.save(tmp_path / "data")
+    assert view(f"scenes={tmp_path / 'data'}", "first=1", "count=2", f"output={tmp_path / 'out'}") == 0
+    title, data = page(tmp_path / "out")
+    assert title == "data"
+    assert [scene["caption"] for scene in data["scenes"]] == prompts[1:3]
+
+
+@pytest.mark.slow
+def test_a_prior_and_a_grammar(tmp_path):
+    tiny_prior(slots=6).save(tmp_path / "prior")
+    words = ("count=2", "num_steps=2")
+    assert view(f"prior={tmp_path / 'prior'}", *words, f"output={tmp_path / 'a'}") == 0
+    assert len(page(tmp_path / "a")[1]["scenes"]) == 2
+    guided, scenes = tiny_prior(slots=6).with_physics_guidance(1.0).save(tmp_path / "guided"), {}
+    for strength in ("null", "1", "0"):
+        assert view(f"prior={guided}", *words, f"physics_guidance={strength}", f"output={tmp_path / strength}") == 0
+        scenes[strength] = page(tmp_path / strength)[1]["scenes"]
+    assert scenes["null"] == scenes["1"] != scenes["0"]
+    for name, seed in (("b", 0), ("c", 0), ("d", 1)):
+        assert view("scene=dimsum_table", "count=2", f"seed={seed}", f"output={tmp_path / name}") == 0
+    first, again, other = (page(tmp_path / name)[1] for name in "bcd")
+    assert first == again != other
+
+
+@pytest.mark.slow
+def test_pictures_are_drawn_beside_the_page(tmp_path):
+    pytest.importorskip("pybullet")
+    assert main(["view", "scene=dimsum_table", "count=2", "pictures=1", f"output={tmp_path / 'a'}"]) == 0
+    assert (tmp_path / "a" / "gallery.png").stat().st_size > 1000
+
+
+def test_the_browser_is_opened_when_asked(samples, tmp_path, monkeypatch, capsys):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", lambda address: opened.append(address) or False)
+    assert view(f"scenes={samples}", "open=true", f"output={tmp_path / 'a'}") == 0
+    assert opened == [(tmp_path / "a" / "viewer.html").resolve().as_uri()]
+    assert "no browser was found" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "say what to show"),
+        (["scenes=RUN", "prior=dimsum_table"], "either scenes= or prior="),
+        (["scene=dimsum_table", "prior=dimsum_table"], "either prior= or scene="),
+        (["scenes=RUN", "first=5"], "first=5 is beyond the 5 scenes"),
+        (["scenes=RUN", "count=0"], "count=0"),
+        (["scene=dimsum_tabel"], "did you mean 'dimsum_table'"),
+        (["prior=dimsum_tabel"], "dimsum_tabel"),
+        (["scenes=RUN/none"], "RUN/none"),
+        (["scenes=RUN/none.safetensors"], "no scene file"),
+    ],
+)
+def test_wrong_input_exits_2_with_one_paragraph(words, message, samples, tmp_path, capsys):
+    words = [word.replace("RUN", str(samples)) for word in words]
+    assert view(*words, f"output={tmp_path / 'out'}") == 2
+    error = capsys.readouterr().err
+    assert message.replace("RUN", str(samples)) in error
+    assert len(error.strip().splitlines()) == 1
+    assert not (tmp_path / "out" / "viewer.html").exists()

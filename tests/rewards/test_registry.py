@@ -1,15 +1,22 @@
-"""Rewards from names, mappings, functions and objects, and errors for wrong specifications."""
+"""Rewards from names, mappings, functions, objects and installed packages, and errors for wrong specifications."""
+
+from __future__ import annotations
 
 import functools
+import re
+from pathlib import Path
 
 import pytest
 import torch
 
+from agents.cli import main
 from rewards import (
     ObjectCount,
     RewardContext,
     RewardOutput,
     allow_reward_targets,
+    check_reward,
+    list_rewards,
     make_reward,
     register_reward,
     registry,
@@ -18,7 +25,7 @@ from rewards import (
     reward_label,
     reward_name,
 )
-from scene_envs.errors import InvalidInputError, UnknownNameError
+from scene_envs.errors import InvalidInputError, RewardError, UnknownNameError
 
 
 def low(batch, context, *, factor=1.0):
@@ -106,3 +113,83 @@ def test_targets_of_allowed_packages_are_built(monkeypatch):
 def test_what_is_no_reward_is_refused(wrong):
     with pytest.raises(InvalidInputError):
         resolve_reward(wrong)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("plugin")
+def test_an_installed_reward_class_is_used_by_name(cups):
+    output = make_reward("open_space", scale=2.0)(cups, RewardContext())
+    torch.testing.assert_close(output.value, torch.tensor([0.4, 0.8]))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("plugin")
+def test_a_module_entry_point_registers_through_its_decorators(cups):
+    assert torch.equal(resolve_reward("flat")(cups, RewardContext()).value, torch.zeros(2))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("plugin")
+def test_installed_rewards_are_listed_and_keep_the_contract():
+    assert {"flat", "object_count", "open_space"} <= set(list_rewards())
+    assert len(check_reward("open_space")) == 6
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("plugin")
+def test_a_target_in_an_installed_reward_package_is_allowed(cups):
+    reward = resolve_reward({"_target_": "open_space_rewards.open_space.OpenSpace", "scale": 1.0})
+    torch.testing.assert_close(reward(cups, RewardContext()).value, torch.tensor([0.2, 0.4]))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("plugin")
+@pytest.mark.usefixtures("copied_workers")
+def test_a_broken_installed_package_is_named(capsys):
+    with pytest.raises(RewardError, match=r"open-space-rewards.*not_there"):
+        resolve_reward("missing_module")
+    assert main(["rewards"]) == 0
+    printed = capsys.readouterr().out
+    assert "missing_module: cannot be used." in printed
+    assert "from: open_space_rewards.open_space" in printed
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("plugin")
+def test_a_near_miss_offers_the_installed_name():
+    with pytest.raises(UnknownNameError, match="did you mean 'open_space'"):
+        resolve_reward("open_spaec")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("plugin")
+def test_the_environment_takes_the_installed_name(cups):
+    from scene_envs.envs.scoring import RewardScorer
+
+    torch.testing.assert_close(RewardScorer("open_space")(cups).value, torch.tensor([0.2, 0.4]))
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def python_blocks(path: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / path).read_text(), re.DOTALL)
+
+
+def test_the_readmes_reward_is_short_and_keeps_the_contract(cups):
+    (block,) = [block for block in python_blocks("README.md") if "@register_reward" in block]
+    assert len([line for line in block.splitlines() if line.strip()]) < 15
+    definition = block.partition("env =")[0]
+    exec(definition, {})
+    check_reward("spread")
+    assert make_reward("spread")(cups, None).value.tolist() == pytest.approx([0.2, 0.4])
+
+
+def test_the_rewards_of_the_documentation_keep_the_contract():
+    blocks = python_blocks("docs/rewards/README.md")
+    for name in ("spread", "upright"):
+        (block,) = [block for block in blocks if f'@register_reward("{name}")' in block]
+        exec(block, {})
+        check_reward(name)
+    (mapping,) = [block for block in blocks if "weighted_sum" in block]
+    resolve_reward(eval(mapping))
