@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from scene_envs import scene_types
 from scene_envs.datasets import to_union
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar
@@ -21,9 +22,8 @@ from scene_envs.render.stage import (
     surface_normals,
 )
 from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type, union_scene_type
-from scene_envs.scene_types import registry as built_in
 
-BUILT_IN = [scene_type.name for scene_type in built_in.BUILT_IN]
+BUILT_IN = [scene_type.name for scene_type in scene_types.BUILT_IN]
 
 
 def in_image(points, camera):
