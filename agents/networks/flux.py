@@ -23,13 +23,13 @@ from agents.networks.flux_modules import (
     CountConditioningConfig,
     CountEmbeddingConfig,
     FluxModule,
+    FourierFeatures,
     FourierFeaturesConfig,
     ModuleConfig,
     ObservedFlagsConfig,
     Place,
     PooledTextConfig,
     Scene,
-    fourier_features,
 )
 from agents.networks.geometry import (
     ContactsConfig,
@@ -180,11 +180,11 @@ class FluxConfig:
             raise InvalidInputError(f"hidden={self.hidden} is not a multiple of heads={self.heads}")
 
 
-def timestep_embedding(value: Tensor, width: int, max_period: float = 10_000.0) -> Tensor:
+def timestep_embedding(value: Tensor, width: int) -> Tensor:
     """Sinusoidal embedding (B, width) of ``value`` (B,), cosines first."""
     half = width // 2
     value = value if value.is_floating_point() else value.float()
-    frequency = torch.exp(-math.log(max_period) * torch.arange(half, device=value.device, dtype=value.dtype) / half)
+    frequency = torch.exp(-math.log(10_000.0) * torch.arange(half, device=value.device, dtype=value.dtype) / half)
     angle = value[:, None] * frequency[None]
     return torch.cat([angle.cos(), angle.sin()], dim=-1)
 
@@ -216,9 +216,7 @@ class FluxDenoiser(nn.Module):
         for layer in (self.final_modulation, self.out):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
-        octaves = math.pi * 2.0 ** torch.arange(config.frequencies, dtype=torch.float32)
-        self.octaves: Tensor
-        self.register_buffer("octaves", octaves, persistent=False)
+        self.fourier = FourierFeatures(config.frequencies)
 
     def forward(self, x: Tensor, position: Tensor, noise_level: Tensor) -> Tensor:
         """Predict.
@@ -228,9 +226,7 @@ class FluxDenoiser(nn.Module):
             position: (B, N, D) the scene in signal units, x_t / alpha_t; its first three features are read.
             noise_level: (B,) noise-to-signal ratio of ``position``.
         """
-        features = x
-        if self.config.frequencies:
-            features = torch.cat([x, fourier_features(position, noise_level[:, None], self.octaves)], dim=-1)
+        features = torch.cat([x, self.fourier(position, noise_level[:, None])], dim=-1)
         condition = self.time_in(timestep_embedding(250.0 * noise_level.log(), 128))
         tokens = self.scene_in(features)
         for block in self.blocks:
@@ -353,11 +349,6 @@ class MixedFluxConfig:
         return replace(self, modules=tuple(module for module in self.modules if module.name not in names))
 
 
-def module_states(config: MixedFluxConfig) -> list[dict[str, Any]]:
-    """The modules for a file: their names and fields."""
-    return [{"name": module.name, **vars(module)} for module in config.modules]
-
-
 def make_module(entry: ModuleConfig | Mapping[str, Any]) -> ModuleConfig:
     """A module's configuration: ``entry`` itself, or made from ``{"name": …, **fields}``."""
     if isinstance(entry, ModuleConfig):
@@ -459,7 +450,9 @@ class MixedFlux(nn.Module):
         tokens = self.scene_in(slots)
         biases = self._relate(scene)
         tokens = self._add(tokens, lambda module: module.messages(scene))
-        tokens = self._attend(tokens, self._words(text, pose), condition, text_mask, biases, scene)
+        text = pose.new_zeros(len(pose), 1, self.config.text_width) if text is None else text
+        words = None if self.text_in is None else self.text_in(text)
+        tokens = self._attend(tokens, words, condition, text_mask, biases, scene)
         shift, scale = self.final_modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
         features = self.final((1 + scale) * F.layer_norm(tokens, (self.config.hidden,), eps=1e-6) + shift)
         logits = self._add(self.logits_out(features), lambda module: module.logits(scene))
@@ -498,11 +491,6 @@ class MixedFlux(nn.Module):
             slots = block(slots, condition, _add_bias(next(biases), mask, count), scene.pairs)
         return slots[:, count:]
 
-    def _words(self, text: Tensor | None, pose: Tensor) -> Tensor | None:
-        if self.text_in is None:
-            return None
-        return self.text_in(pose.new_zeros(len(pose), 1, self.config.text_width) if text is None else text)
-
     # -- modules ----------------------------------------------------------------------------------
 
     def _build_modules(self, place: Place) -> None:
@@ -522,10 +510,7 @@ class MixedFlux(nn.Module):
         return value
 
     def _take_text(self, scene: Scene, text: Tensor | None, mask: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        """The tokens that are not for single modules, with their mask.
-
-        Puts the leading tokens of modules, and the mean of the other tokens, into ``scene``.
-        """
+        """The tokens after those of single modules, with their mask; puts theirs, and the mean, into ``scene``."""
         if text is None:
             return None, mask
         for module in self.config.modules:
@@ -533,15 +518,15 @@ class MixedFlux(nn.Module):
             if count:
                 scene.own_text[module.name], text = text[:, :count], text[:, count:]
                 mask = None if mask is None else mask[:, count:]
-        scene.summary = _mean_token(text, mask)
+        if mask is None:
+            scene.summary = text.mean(dim=1)
+        else:
+            real = mask[..., None].to(text)
+            scene.summary = (text * real).sum(dim=1) / real.sum(dim=1).clamp(min=1.0)
         return text, mask
 
     def _read_geometry(self, scene: Scene, position: Tensor | None, noise_level: Tensor | None) -> None:
-        """Put translations in metres, rotations, and the noise on them into ``scene``, where modules read them.
-
-        Raises:
-            InvalidInputError: a module reads geometry, and none is given.
-        """
+        """Put translations in metres, rotations, and the noise on them into ``scene``, where modules read them."""
         readers = [module.name for module in self.config.modules if module.reads_geometry]
         if not readers:
             return
@@ -564,14 +549,6 @@ class MixedFlux(nn.Module):
         biases, features = zip(*parts, strict=True)
         scene.pairs = features[0] if len(features) == 1 else torch.cat(features, dim=-1)
         return iter(biases[0] if len(biases) == 1 else torch.stack(biases).sum(dim=0))
-
-
-def _mean_token(text: Tensor, mask: Tensor | None) -> Tensor:
-    """(B, W) mean of the tokens (B, L, W) that are not padding."""
-    if mask is None:
-        return text.mean(dim=1)
-    real = mask[..., None].to(text)
-    return (text * real).sum(dim=1) / real.sum(dim=1).clamp(min=1.0)
 
 
 def _where_to_attend(text_mask: Tensor | None, slot_mask: Tensor | None, count: int, slots: Tensor) -> Tensor | None:

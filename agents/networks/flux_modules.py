@@ -188,9 +188,7 @@ class ObservedFlags(FluxModule):
         nn.init.zeros_(self.embedding.weight)
 
     def slot_features(self, scene: Scene) -> Tensor | None:
-        if scene.observed is None:
-            return None
-        return self.embedding(scene.observed)
+        return None if scene.observed is None else self.embedding(scene.observed)
 
 
 # -- text -----------------------------------------------------------------------------------------
@@ -216,9 +214,7 @@ class PooledText(FluxModule):
         self.linear = nn.Linear(text_width, hidden, bias=False)
 
     def condition(self, scene: Scene) -> Tensor | None:
-        if scene.summary is None:
-            return None
-        return self.linear(scene.summary)
+        return None if scene.summary is None else self.linear(scene.summary)
 
 
 # -- counts ---------------------------------------------------------------------------------------
@@ -256,17 +252,7 @@ def count_states(states: Tensor, categories: int, slot_mask: Tensor | None = Non
 
 
 class CountEmbedding(FluxModule):
-    """Counts of visible slots and the mean text token, to one vector (B, H) that is added to the condition.
-
-    Args:
-        categories: K = C + 1.
-        text_width: width of the text tokens; 0 for none.
-        hidden: H.
-
-    >>> count_embedding = CountEmbedding(categories=8, text_width=16, hidden=32)
-    >>> count_embedding(torch.randint(9, (2, 5)), torch.randn(2, 16)).shape
-    torch.Size([2, 32])
-    """
+    """Counts of visible slots and the mean text token (zeros without text), to one vector (B, H)."""
 
     def __init__(self, categories: int, text_width: int, hidden: int) -> None:
         super().__init__()
@@ -276,14 +262,11 @@ class CountEmbedding(FluxModule):
         )
 
     def condition(self, scene: Scene) -> Tensor | None:
-        return self(scene.states, scene.summary, scene.slot_mask)
-
-    def forward(self, states: Tensor, text: Tensor | None = None, slot_mask: Tensor | None = None) -> Tensor:
-        """Embed the numbers of :func:`count_states` with ``text`` (B, W), the mean text token; zeros when None."""
-        counts = count_states(states, self.categories, slot_mask).to(next(self.parameters()).dtype)
+        counts = count_states(scene.states, self.categories, scene.slot_mask).to(next(self.parameters()).dtype)
         inputs = [counts / 8.0, counts.log1p()]
         if self.text_width:
-            inputs.append(counts.new_zeros(len(counts), self.text_width) if text is None else text)
+            nothing = counts.new_zeros(len(counts), self.text_width)
+            inputs.append(nothing if scene.summary is None else scene.summary)
         return self.layers(torch.cat(inputs, dim=1))
 
 
@@ -377,9 +360,7 @@ class CountConditioning(FluxModule):
 
     def logits(self, scene: Scene) -> Tensor | None:
         tokens = scene.own_text.get(CountConditioningConfig.name)
-        if tokens is None:
-            return None
-        return self(scene.states, tokens, scene.slot_mask)[:, None]
+        return None if tokens is None else self(scene.states, tokens, scene.slot_mask)[:, None]
 
     def forward(self, states: Tensor, tokens: Tensor, slot_mask: Tensor | None = None) -> Tensor:
         """Logits (B, K).
@@ -478,14 +459,10 @@ class FourierFeatures(FluxModule):
     def pose_features(self, scene: Scene) -> Tensor | None:
         if scene.position is None or scene.noise_level is None:
             return None
-        return fourier_features(scene.position, scene.noise_level, self.octaves)
+        return self(scene.position, scene.noise_level)
 
-
-def fourier_features(position: Tensor, noise_level: Tensor, octaves: Tensor) -> Tensor:
-    """(B, N, 6 F) features of translations under noise (B, N).
-
-    The translations are the first three features of ``position`` (B, N, D).
-    """
-    angle = position[..., :3, None] * octaves  # (B, N, 3, F)
-    damping = torch.exp(-0.5 * (octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
-    return torch.cat([(angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)
+    def forward(self, position: Tensor, noise_level: Tensor) -> Tensor:
+        """Features of the first three numbers of ``position`` (B, N, D) under noise (B, N)."""
+        angle = position[..., :3, None] * self.octaves  # (B, N, 3, F)
+        damping = torch.exp(-0.5 * (self.octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
+        return torch.cat([(angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)

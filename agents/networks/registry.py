@@ -28,7 +28,6 @@ from agents.networks.flux import (
     MixedFlux,
     MixedFluxConfig,
     make_module,
-    module_states,
 )
 from agents.networks.flux_modules import FourierFeaturesConfig, ModuleConfig, ObservedFlagsConfig
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -48,14 +47,7 @@ NetworkConfig = ContinuousNetworkConfig | MixedNetworkConfig
 
 @dataclass(frozen=True)
 class _Entry:
-    """Entry of a network in the registry.
-
-    Attributes:
-        config: class of its configuration, a frozen dataclass.
-        network: builds a network with fresh weights from a configuration.
-        ratio: the field besides ``hidden`` that :func:`match_parameters` adjusts; None where there is none.
-        sizes: maps the keys of :func:`network_config` to fields of the configuration.
-    """
+    """The arguments of :func:`register_network`."""
 
     config: type[Any]
     network: Callable[[Any], nn.Module]
@@ -175,7 +167,9 @@ def config_state(config: NetworkConfig) -> dict[str, Any]:
     entry = _entry_of(config)
     (name,) = [name for (name, _), known in _ENTRIES.items() if known is entry]
     state = {"kind": name, **asdict(config)}
-    return {**state, "modules": module_states(config)} if isinstance(config, MixedFluxConfig) else state
+    if isinstance(config, MixedFluxConfig):
+        state["modules"] = [{"name": module.name, **vars(module)} for module in config.modules]
+    return state
 
 
 def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
@@ -212,11 +206,6 @@ def _entry(name: str, process: str) -> _Entry:
     return _ENTRIES[name, process]
 
 
-def ratio_name(name: str, process: str) -> str | None:
-    """The field besides ``hidden`` that :func:`match_parameters` adjusts; None where there is none."""
-    return _entry(name, process).ratio
-
-
 def _entry_of(config: Any) -> _Entry:
     found = [entry for entry in _ENTRIES.values() if entry.config is type(config)]
     if not found:
@@ -235,19 +224,17 @@ def _continuous_flux(keys: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _mixed_flux(keys: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of the Flux core, and its modules in the order of ``MODULES``."""
     core = ("categories", "hidden", "heads", "text_width", "text_reach", "pose_head", "time_scale", "unit", "rotations")
     chosen = keys["modules"] if keys["modules"] is not None else [ObservedFlagsConfig()]
     octaves = keys["frequencies"]
     modules = [make_module(entry) for entry in chosen] + ([FourierFeaturesConfig(octaves)] if octaves else [])
-    order = list(MODULES)
     return {
         **{name: keys[name] for name in core},
         "double_blocks": max(1, keys["depth"] // 3) if keys["double_blocks"] is None else keys["double_blocks"],
         "single_blocks": keys["depth"],
         "embedding": keys["hidden"] if keys["embedding"] is None else keys["embedding"],
         "time_input": "log_noise" if octaves else "timestep",
-        "modules": tuple(sorted(modules, key=lambda module: order.index(module.name))),
+        "modules": tuple(sorted(modules, key=lambda module: list(MODULES).index(module.name))),
     }
 
 
@@ -271,9 +258,6 @@ for _arguments in (
     ("diffuscene", "mixed", MixedDiffuSceneConfig, MixedDiffuScene, "inner_ratio", _diffuscene("categories")),
 ):
     register_network(*_arguments[:4], ratio=_arguments[4], sizes=_arguments[5])
-
-
-_RATIO_STEPS, _RATIO_STEP = 24, 1 / 64
 
 
 @lru_cache(maxsize=1024)
@@ -310,7 +294,7 @@ def match_parameters(name: str, process: str, target: int, **sizes: Any) -> Netw
     >>> abs(parameter_count(theirs) / parameter_count(ours) - 1) < 0.03
     True
     """
-    ratio_field = ratio_name(name, process)
+    ratio_field = _entry(name, process).ratio
 
     def at_width(units: int) -> NetworkConfig:
         return network_config(name, process, hidden=units * sizes["heads"], **sizes)
@@ -318,8 +302,7 @@ def match_parameters(name: str, process: str, target: int, **sizes: Any) -> Netw
     def at_ratio(config: NetworkConfig, step: int) -> NetworkConfig:
         if ratio_field is None:
             return config
-        ratio = getattr(config, ratio_field) * (1 + step * _RATIO_STEP)
-        return replace(config, **{ratio_field: ratio})
+        return replace(config, **{ratio_field: getattr(config, ratio_field) * (1 + step / 64)})
 
     smallest = parameter_count(at_width(1))
     if target < smallest:
@@ -333,12 +316,9 @@ def match_parameters(name: str, process: str, target: int, **sizes: Any) -> Netw
     width = _last(1, highest, lambda units: parameter_count(at_width(units)) <= target)
     candidates: list[tuple[NetworkConfig, int]] = []
     for units in (width, width + 1):
-        step = _last(
-            -_RATIO_STEPS,
-            _RATIO_STEPS - 1,
-            lambda step, units=units: parameter_count(at_ratio(at_width(units), step)) <= target,  # type: ignore[misc]
-        )
-        candidates += [(at_ratio(at_width(units), near), abs(near)) for near in (step, step + 1, 0)]
+        config = at_width(units)
+        step = _last(-24, 23, lambda step, config=config: parameter_count(at_ratio(config, step)) <= target)  # type: ignore[misc]
+        candidates += [(at_ratio(config, near), abs(near)) for near in (step, step + 1, 0)]
 
     def distance(candidate: tuple[NetworkConfig, int]) -> tuple[float, int]:
         """Sort key: relative error of the count, where errors below 1 % count as 1 %, then change of the ratio."""

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError
@@ -36,15 +36,8 @@ FOLDER_VARIABLE = "SCENE_ENVS_BERT"
 _HUB_NAME = re.compile(r"[\w.-]+(/[\w.-]+)?")
 
 
-@dataclass(frozen=True, eq=False)
-class Bert:
-    """A loaded model.
-
-    Attributes:
-        model: ``transformers.BertModel``, frozen.
-        tokenizer: its tokenizer.
-        digest: SHA-256 of weights and vocabulary.
-    """
+class Bert(NamedTuple):
+    """A loaded model: a frozen ``transformers.BertModel``, its tokenizer, and the digest of weights and vocabulary."""
 
     model: Any
     tokenizer: Any
@@ -110,19 +103,6 @@ def _transformers() -> Any:
             "'scene-envs[bert]'; without it, sample without a prompt"
         ) from error
     return transformers
-
-
-def download_bert(model: str) -> None:
-    """Fetch a hub model into the local cache, unless it is there or ``model`` is a folder."""
-    _transformers()
-    from huggingface_hub import snapshot_download
-
-    if os.path.isdir(model):
-        return
-    try:
-        snapshot_download(model, allow_patterns=["*.json", "vocab.txt", "model.safetensors"])
-    except Exception as error:
-        _LOGGER.info("%s could not be downloaded (%s); the local cache is looked into", model, _first_line(error))
 
 
 def _not_at_hand(model: str, error: Exception) -> str:
@@ -196,8 +176,16 @@ class BertTextConfig:
             InvalidInputError: no such model at hand, or not a BERT.
         """
         name = os.path.abspath(model) if Path(model).is_dir() else str(model)
-        if download:
-            download_bert(name)
+        if download and not os.path.isdir(name):
+            _transformers()
+            from huggingface_hub import snapshot_download
+
+            try:
+                snapshot_download(name, allow_patterns=["*.json", "vocab.txt", "model.safetensors"])
+            except Exception as error:
+                _LOGGER.info(
+                    "%s could not be downloaded (%s); the local cache is looked into", name, _first_line(error)
+                )
         bert = load_bert(name)
         nothing = tuple(bert.tokenizer("")["input_ids"])
         settings = bert.model.config

@@ -56,7 +56,9 @@ def test_an_ablation_leaves_out_one_module_and_its_weights_alone(name: str) -> N
 
 def test_the_core_alone_is_the_network_of_the_paper() -> None:
     core = build_network(everything().without(*(module.name for module in everything().modules)))
-    sizes = {**vars(PretrainConfig(recipe="paper").network), "modules": ()}
+    paper_network = vars(PretrainConfig(recipe="paper").network)
+    sizes = {**paper_network, **vars(paper_network["flux"]), "modules": ()}
+    del sizes["flux"]
     paper = network_config(process="mixed", features=20, categories=8, text_width=768, **sizes)
     assert isinstance(paper, MixedFluxConfig)
     assert paper.modules == ()
