@@ -14,14 +14,8 @@ import torch
 from torch import Generator, Tensor
 
 from agents.configuration.composition import check_types
-from agents.diffusion import GaussianProcess, GaussianStep, Preconditioning, ResidualVariance, ReverseStep, StepTable
-from agents.diffusion.gaussian import (
-    check_weighting,
-    loss_weights,
-    make_schedule,
-    timestep_distribution,
-    timestep_weights,
-)
+from agents.diffusion import GaussianStep, Preconditioning, ResidualVariance, ReverseStep, StepTable
+from agents.diffusion.gaussian import loss_weights
 from agents.networks.denoisers import Denoiser
 from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import Text
@@ -73,13 +67,8 @@ class ContinuousPrior(ScenePrior):
         super().__init__()
         self.code = SceneCode(get_scene_type(config.scene_type), config.rotation, normalizer)
         _check_network(config, self.code)
-        check_weighting(config.loss_weighting, config.prediction)
         self._keep(config, normalizer, preconditioning, card, residual)
-        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
-        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         self.denoiser = Denoiser(build_network(config.network), self.process)
-        distribution = timestep_distribution(config.timesteps, config.prediction)
-        self._timestep_weights = timestep_weights(distribution, schedule, config.noise_mean, config.noise_std)
 
     @classmethod
     def fitted(
@@ -101,18 +90,11 @@ class ContinuousPrior(ScenePrior):
         return cls(config, normalizer, fitted if moments == "feature" else fitted.pooled())
 
     @classmethod
-    def from_state(
-        cls,
-        fields: dict[str, Any],
-        normalizer: Normalizer,
-        preconditioning: Preconditioning,
-        card: dict[str, Any] | None,
-        residual: ResidualVariance | None,
-    ) -> ContinuousPrior:
-        """From the ``prior`` entry of a configuration file."""
+    def config_from_state(cls, fields: dict[str, Any]) -> PriorConfig:
+        """The configuration in the ``prior`` entry of a file."""
         fields = {**fields, "network": config_from_state(fields["network"], "continuous")}
         check_types(PriorConfig, fields)
-        return cls(PriorConfig(**fields), normalizer, preconditioning, card, residual)
+        return PriorConfig(**fields)
 
     # -- scenes and numbers ---------------------------------------------------------------------
 
@@ -227,19 +209,10 @@ class ContinuousPrior(ScenePrior):
             raise no_text(self.scene_type, "")
         return DenoiserOutput(self.denoiser.output(noised.x_t, noised.t))
 
-    @torch.no_grad()
-    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
-        """Measure the denoiser's error on normalised scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
-        generator = Generator().manual_seed(seed)
-        timesteps = StepTable.spaced(self.config.num_timesteps, levels).timesteps.flip(0)
-        rows = []
-        for t in timesteps:
-            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
-            x_t = self.clamp(self.process.add_noise(x0, t, noise))
-            error = self.denoiser(x_t, t.to(x0.device).expand(len(x0))) - x0
-            rows.append(error[:, len(self.scene_type.fixed) :].square().mean(dim=(0, 1)).cpu())
-        self.residual = ResidualVariance(timesteps, torch.stack(rows))
-        return self.residual
+    def mean_square_error(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """(D,) error of every number of free slots, as :meth:`ScenePrior.mean_square_error` describes it."""
+        error = self.denoiser(self.clamp(self.process.add_noise(x0, t, noise)), t) - x0
+        return error[:, len(self.scene_type.fixed) :].square().mean(dim=(0, 1))
 
 
 def _check_network(config: PriorConfig, code: SceneCode) -> None:

@@ -16,16 +16,9 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from agents.configuration.composition import check_types
-from agents.diffusion import (
-    CategoricalProcess,
-    GaussianProcess,
-    MixedStep,
-    Preconditioning,
-    ResidualVariance,
-    StepTable,
-)
+from agents.diffusion import CategoricalProcess, MixedStep, Preconditioning, ResidualVariance, StepTable
 from agents.diffusion.categorical import UNMASKINGS, make_categorical_schedule
-from agents.diffusion.gaussian import check_weighting, loss_weights, make_schedule, timestep_weights
+from agents.diffusion.gaussian import loss_weights
 from agents.diffusion.reverse_steps import ReverseStep, state_of
 from agents.networks.denoisers import MixedDenoiser, Observed
 from agents.networks.flux_modules import CountConditioning
@@ -112,12 +105,9 @@ class MixedPrior(ScenePrior):
             raise unknown_name("unmasking", config.unmasking, UNMASKINGS)
         if config.union not in UNIONS:
             raise unknown_name("union", config.union, UNIONS)
-        check_weighting(config.loss_weighting, config.prediction)
         if config.empty_slots == "dropped" and not getattr(config.network, "reads_slot_mask", False):
             raise InvalidInputError("empty_slots='dropped' needs network='flux'; others take empty_slots='attended'")
         self._keep(config, normalizer, preconditioning, card, residual)
-        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
-        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         self.categories = CategoricalProcess(
             make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
         )
@@ -127,22 +117,14 @@ class MixedPrior(ScenePrior):
         self.denoiser = MixedDenoiser(
             build_network(config.network), self.process, self.categories, encoder, config.empty_slots
         )
-        self._timestep_weights = timestep_weights(config.timesteps, schedule, config.noise_mean, config.noise_std)
 
     @classmethod
-    def from_state(
-        cls,
-        fields: dict[str, Any],
-        normalizer: Normalizer,
-        preconditioning: Preconditioning,
-        card: dict[str, Any] | None,
-        residual: ResidualVariance | None,
-    ) -> MixedPrior:
-        """From the ``prior`` entry of a configuration file."""
+    def config_from_state(cls, fields: dict[str, Any]) -> MixedPriorConfig:
+        """The configuration in the ``prior`` entry of a file."""
         text = text_config_from_state(fields.get("text"))
         fields = {**fields, "network": config_from_state(fields["network"], "mixed"), "text": text}
         check_types(MixedPriorConfig, fields)
-        return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
+        return MixedPriorConfig(**fields)
 
     def weights(self) -> dict[str, Tensor]:
         """Tensors of the network, and those of the text encoder under ``text_encoder.``."""
@@ -559,25 +541,16 @@ class MixedPrior(ScenePrior):
         fixed[: len(self.scene_type.fixed)] = True
         return Observed(x0, (pose | fixed).to(x0.device), (category | fixed).to(x0.device))
 
-    @torch.no_grad()
-    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
-        """Measure the error of the denoised pose on scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
-        generator = Generator().manual_seed(seed)
-        timesteps = StepTable.spaced(self.config.num_timesteps, levels).timesteps.flip(0)
+    def mean_square_error(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """(12,) error of the poses of free objects, as :meth:`ScenePrior.mean_square_error` describes it."""
         present = (x0[..., POSE_FEATURES:].argmax(dim=-1) != self.num_categories - 1).float()
         present[:, : len(self.scene_type.fixed)] = 0.0
-        rows = []
-        for t in timesteps:
-            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
-            level = t.to(x0.device).expand(len(x0))
-            poses = [
-                self.denoiser(part, level[: len(part)], self.observed_entries(part), self.unconditional(len(part)))[0]
-                for part in self.add_noise(x0, level, noise).split(_AT_ONCE)
-            ]
-            error = (torch.cat(poses) - x0[..., :POSE_FEATURES]).square() * present[..., None]
-            rows.append((error.sum(dim=(0, 1)) / present.sum()).cpu())
-        self.residual = ResidualVariance(timesteps, torch.stack(rows))
-        return self.residual
+        poses = [
+            self.denoiser(part, t[: len(part)], self.observed_entries(part), self.unconditional(len(part)))[0]
+            for part in self.add_noise(x0, t, noise).split(_AT_ONCE)
+        ]
+        error = (torch.cat(poses) - x0[..., :POSE_FEATURES]).square() * present[..., None]
+        return error.sum(dim=(0, 1)) / present.sum()
 
 
 def prompt_words(scene_type: SceneType) -> tuple[str, ...]:
