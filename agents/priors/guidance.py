@@ -62,6 +62,7 @@ class Estimating(Protocol):
     """A prior, as far as hooks need it."""
 
     normalizer: Normalizer
+    scene_type: SceneType
 
     def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
         """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
@@ -298,17 +299,22 @@ def physics_strength(given: float | None, config: Any, scene_type: SceneType) ->
 
 
 def guidance_hook(
-    prior: Estimating, scene_type: SceneType, table: StepTable, scenes: Callable[[Tensor], SceneBatch], moved: Tensor,
-    *, prompts: Sequence[str] | None = None, claim_guidance: float = 0.0, physics_guidance: float = 0.0,
-    guide: Guide | None = None, watch: Watch | None = None,
-) -> Hook | None:  # fmt: skip
+    prior: Estimating,
+    table: StepTable,
+    scenes: Callable[[Tensor], SceneBatch],
+    moved: Tensor,
+    prompts: Sequence[str] | None,
+    claim_guidance: float,
+    physics_guidance: float,
+    guide: Guide | None = None,
+    watch: Watch | None = None,
+) -> Hook | None:
     """The hook of one chain under guidance; None if nothing watches or guides it.
 
     At a step it calls ``watch.see``, number guidance, ``guide``, claim guidance, physics guidance, and ``watch``.
 
     Args:
         prior: prior that denoises.
-        scene_type: scene type of the scenes.
         table: the chain.
         scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
         moved: (B, N, 1) bool, slots whose poses are denoised.
@@ -321,8 +327,8 @@ def guidance_hook(
     guides: list[Guide] = [] if guide is None else [guide]
     draw = None
     if prompts is not None and claim_guidance:
-        guides.append(ClaimGuidance(prompts, scene_type, claim_guidance, movable))
-        draw = NumberGuidance(prompts, scene_type)
+        guides.append(ClaimGuidance(prompts, prior.scene_type, claim_guidance, movable))
+        draw = NumberGuidance(prompts, prior.scene_type)
     if physics_guidance:
         guides.append(PhysicsGuidance(physics_guidance, movable))
     see = getattr(watch, "see", None)

@@ -414,9 +414,15 @@ class ScenePrior(nn.Module, ABC):
                 size, wide, num_steps, prompts=texts, claim_guidance=claim_guidance, physics_guidance=strength
             )
             x0 = self.sample_tensor(
-                size, prompts=texts, guidance=guidance, num_steps=num_steps, slots=slots, generator=generator, eta=eta,
+                size,
+                prompts=texts,
+                guidance=guidance,
+                num_steps=num_steps,
+                slots=slots,
+                generator=generator,
+                eta=eta,
                 hook=hook,
-            )  # fmt: skip
+            )
             chunks.append(x0)
         return self.decode(torch.cat(chunks))
 
@@ -453,10 +459,8 @@ class ScenePrior(nn.Module, ABC):
         """
         moved = torch.ones(count, slots, 1, dtype=torch.bool)
         moved[:, : len(self.scene_type.fixed)] = False
-        return guidance_hook(
-            self, self.scene_type, self.step_table(num_steps), self.decode, moved,
-            prompts=prompts, claim_guidance=claim_guidance, physics_guidance=physics_guidance,
-        )  # fmt: skip
+        table = self.step_table(num_steps)
+        return guidance_hook(self, table, self.decode, moved, prompts, claim_guidance, physics_guidance)
 
     # -- inpainting -------------------------------------------------------------------------------
 
@@ -508,22 +512,16 @@ class ScenePrior(nn.Module, ABC):
         strength = physics_strength(physics_guidance, self.config, self.scene_type)
         if generators is None:
             generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
-        device, table = self.device, self.step_table(num_steps)
-        moved = both[..., :1]
+        table = self.step_table(num_steps)
 
         def scenes(x: Tensor) -> SceneBatch:
             return merge(batch, self.decode(x).to(batch.tensor.device), both)
 
-        hook = guidance_hook(
-            self, self.scene_type, table, scenes, moved, prompts=prompts, claim_guidance=claim_guidance,
-            physics_guidance=strength, guide=guide, watch=watch,
-        )  # fmt: skip
+        hook = guidance_hook(self, table, scenes, both[..., :1], prompts, claim_guidance, strength, guide, watch)
         begins = getattr(watch, "start", None)
         start = None if begins is None else begins(len(table))
-        x = self.regenerate(
-            batch.to(device), both.to(device), table, generators, resample, prompts, guidance, hook, start
-        )
-        return merge(batch, self.decode(x).to(batch.tensor.device), both)
+        given, open_entries = batch.to(self.device), both.to(self.device)
+        return scenes(self.regenerate(given, open_entries, table, generators, resample, prompts, guidance, hook, start))
 
     def _check_prompts(
         self, prompt: Prompt, guidance: float, claim_guidance: float, count: int, slots: int
@@ -570,9 +568,15 @@ class ScenePrior(nn.Module, ABC):
             raise InvalidInputError(f"fill={fill}: give the most objects to add, at least 0, or None")
         open_slots = wide.is_empty if fill is None else wide.is_empty & (wide.is_empty.cumsum(dim=1) <= fill)
         return self.inpaint(
-            wide, open_slots, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance,
-            physics_guidance=physics_guidance, num_steps=num_steps, seed=seed,
-        )  # fmt: skip
+            wide,
+            open_slots,
+            prompt=prompt,
+            guidance=guidance,
+            claim_guidance=claim_guidance,
+            physics_guidance=physics_guidance,
+            num_steps=num_steps,
+            seed=seed,
+        )
 
     def rearrange(
         self, batch: SceneBatch, *, prompt: Prompt = None, guidance: float = 0.0,
@@ -585,9 +589,15 @@ class ScenePrior(nn.Module, ABC):
         free = batch.is_free
         mask = torch.stack([free, torch.zeros_like(free)], dim=-1)
         return self.inpaint(
-            batch, mask, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance,
-            physics_guidance=physics_guidance, num_steps=num_steps, seed=seed,
-        )  # fmt: skip
+            batch,
+            mask,
+            prompt=prompt,
+            guidance=guidance,
+            claim_guidance=claim_guidance,
+            physics_guidance=physics_guidance,
+            num_steps=num_steps,
+            seed=seed,
+        )
 
     @abstractmethod
     def regenerate(
