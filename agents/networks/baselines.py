@@ -21,7 +21,9 @@ order of slots, although scenes have no order.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -29,6 +31,7 @@ from torch.nn import functional as F
 
 from agents.networks.flux import timestep_embedding
 from agents.networks.flux_modules import FourierFeatures
+from agents.networks.registry import register_network
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import POSE_FEATURES
 
@@ -454,3 +457,22 @@ class MixedDiffuScene(MixedBaseline):
 
     def __init__(self, config: MixedDiffuSceneConfig) -> None:
         super().__init__(config, _UNet(config))
+
+
+# -- registration ---------------------------------------------------------------------------------
+
+
+def _midiffusion(keys: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: keys[name] for name in ("hidden", "depth", "heads", "text_width")}
+
+
+def _diffuscene(keys: Mapping[str, Any]) -> dict[str, Any]:
+    return {**{name: keys[name] for name in ("hidden", "heads", "text_width")}, "blocks": max(1, keys["depth"] // 3)}
+
+
+register_network("midiffusion", "continuous", MiDiffusionConfig, MiDiffusion, ratio="mlp_ratio", sizes=_midiffusion)
+register_network(
+    "midiffusion", "mixed", MixedMiDiffusionConfig, MixedMiDiffusion, ratio="mlp_ratio", sizes=_midiffusion
+)
+register_network("diffuscene", "continuous", DiffuSceneConfig, DiffuScene, ratio="inner_ratio", sizes=_diffuscene)
+register_network("diffuscene", "mixed", MixedDiffuSceneConfig, MixedDiffuScene, ratio="inner_ratio", sizes=_diffuscene)

@@ -101,8 +101,8 @@ class MixedDenoiser(nn.Module):
         network: nn.Module,
         poses: GaussianProcess,
         categories: CategoricalProcess,
-        text_encoder: TextEncoder | BertEncoder | None = None,
-        empty_slots: str = "attended",
+        text_encoder: TextEncoder | BertEncoder | None,
+        empty_slots: str,
     ) -> None:
         super().__init__()
         if empty_slots not in EMPTY_SLOTS:

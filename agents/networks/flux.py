@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, ClassVar
 
 import torch
@@ -38,6 +38,7 @@ from agents.networks.geometry import (
     joint_attention,
     nearest_rotations,
 )
+from agents.networks.registry import register_network
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import POSE_FEATURES
 
@@ -336,6 +337,10 @@ class MixedFluxConfig:
         """Features of a pair of slots, of all modules."""
         return sum(module.pair_width for module in self.modules)
 
+    def state(self) -> dict[str, Any]:
+        """The fields for a file, the names of the modules among theirs."""
+        return {**asdict(self), "modules": [{"name": module.name, **vars(module)} for module in self.modules]}
+
     def without(self, *names: str) -> MixedFluxConfig:
         """The same network without some modules, which is an ablation.
 
@@ -567,3 +572,31 @@ def _add_bias(bias: Tensor | None, mask: Tensor | None, count: int) -> Tensor | 
         return mask
     bias = F.pad(bias, (count, 0, count, 0)) if count else bias
     return bias if mask is None else bias.masked_fill(~mask, -torch.inf)
+
+
+# -- registration ---------------------------------------------------------------------------------
+
+
+def _continuous_sizes(keys: Mapping[str, Any]) -> dict[str, Any]:
+    if keys["text_width"]:
+        raise InvalidInputError(f"text_width={keys['text_width']}: the continuous flux network reads no text; use 0")
+    return {name: keys[name] for name in ("hidden", "depth", "heads", "frequencies")}
+
+
+def _mixed_sizes(keys: Mapping[str, Any]) -> dict[str, Any]:
+    core = ("hidden", "heads", "text_width", "text_reach", "pose_head", "time_scale", "unit", "rotations")
+    chosen = keys["modules"] if keys["modules"] is not None else [ObservedFlagsConfig()]
+    octaves = keys["frequencies"]
+    modules = [make_module(entry) for entry in chosen] + ([FourierFeaturesConfig(octaves)] if octaves else [])
+    return {
+        **{name: keys[name] for name in core},
+        "double_blocks": max(1, keys["depth"] // 3) if keys["double_blocks"] is None else keys["double_blocks"],
+        "single_blocks": keys["depth"],
+        "embedding": keys["hidden"] if keys["embedding"] is None else keys["embedding"],
+        "time_input": "log_noise" if octaves else "timestep",
+        "modules": tuple(sorted(modules, key=lambda module: list(MODULES).index(module.name))),
+    }
+
+
+register_network("flux", "continuous", FluxConfig, FluxDenoiser, ratio="mlp_ratio", sizes=_continuous_sizes)
+register_network("flux", "mixed", MixedFluxConfig, MixedFlux, ratio="mlp_ratio", sizes=_mixed_sizes)

@@ -135,8 +135,6 @@ def _digest(model: nn.Module, tokenizer: Any) -> str:
 
 Row = tuple[int, ...]
 """The tokens of one prompt, without padding."""
-CACHED_PROMPTS = 4096
-"""Number of latest prompts whose hidden states are cached."""
 _TOGETHER = 64
 """Prompts encoded together on an accelerator; on CPU each is encoded alone, so that no result depends on others."""
 
@@ -199,16 +197,16 @@ class BertEncoder(nn.Module):
 
     Its only own tensor is ``nothing`` (2, W), the hidden states of the empty prompt ``""``. A prior's file holds this
     tensor and not BERT, so that the prior can be sampled without prompts where BERT is not at hand. Copies of a prior
-    share one BERT. The hidden states of the latest prompts are cached.
+    share one BERT.
 
     Args:
         config: configuration that names the BERT.
-        cached: number of prompts whose hidden states are cached.
+        cached: number of latest prompts whose hidden states are cached.
     """
 
     nothing: Tensor
 
-    def __init__(self, config: BertTextConfig, cached: int = CACHED_PROMPTS) -> None:
+    def __init__(self, config: BertTextConfig, cached: int = 4096) -> None:
         super().__init__()
         self.config = config
         self.cached = cached
