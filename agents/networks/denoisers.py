@@ -79,9 +79,9 @@ class Observed:
         """(B, N) int64 as the network reads them: 1 where the pose is observed, plus 2 where the category is."""
         return self.pose.long() + 2 * self.category.long()
 
-    def entries(self) -> Tensor:
-        """(B, N, D) bool."""
-        is_pose = torch.arange(self.x.shape[-1], device=self.x.device) < POSE_FEATURES
+    def entries(self, pose_width: int = POSE_FEATURES) -> Tensor:
+        """(B, N, D) bool; the first ``pose_width`` numbers of a slot are its pose."""
+        is_pose = torch.arange(self.x.shape[-1], device=self.x.device) < pose_width
         return torch.where(is_pose, self.pose[..., None], self.category[..., None])
 
     def write(self, x: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import PADDING, Text, TextEncoder, vocabulary, warn_unknown
 from agents.networks.text_encoders import text_config_from_state, text_encoder
 from agents.priors.config import MixedPriorConfig
-from agents.priors.guidance import Hook, Start
+from agents.priors.guidance import Hook
 from agents.priors.prior import (
     UNIONS,
     DenoiserOutput,
@@ -168,7 +168,7 @@ class MixedPrior(ScenePrior):
         indices, unknown = encoder.tokenize(prompts)
         warn_unknown(unknown)
         longest = encoder.token_space[0]
-        return torch.nn.functional.pad(indices, (0, longest - indices.shape[1]), value=PADDING)
+        return F.pad(indices, (0, longest - indices.shape[1]), value=PADDING)
 
     def encode_tokens(self, indices: Tensor) -> Text:
         """Tokens (B, L', W) and mask (B, L') of token indices (B, L); equal rows are encoded once."""
@@ -262,10 +262,9 @@ class MixedPrior(ScenePrior):
         self.config = replace(self.config, open_empty_share=share)
         return self
 
-    def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
-        """x_T (count, slots, D): normal poses, categories from their distribution at T, known entries clamped."""
-        noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
-        probs = self.categories.prior().to(noise).expand(count, slots, -1)
+    def initial_from_noise(self, noise: Tensor) -> Tensor:
+        """x_T (B, N, D) from ``noise``: normal poses, and categories drawn from their distribution at T."""
+        probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
         return self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
 
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
@@ -386,34 +385,12 @@ class MixedPrior(ScenePrior):
         )
 
     @torch.no_grad()
-    def sample_tensor(
-        self, count: int, *, prompts: Sequence[str] | None = None, guidance: float = 0.0, num_steps: int = 50,
-        slots: int | None = None, generator: Generator | None = None, eta: float = 1.0, hook: Hook | None = None,
-    ) -> Tensor:  # fmt: skip
-        """``count`` denoised scenes x_0 (count, slots, D), as :meth:`ScenePrior.sample_tensor` describes."""
-        text = None if prompts is None else self.encode_prompts(prompts)
-        start = self.initial(count, self.config.slots if slots is None else slots, generator)
-        table = self.step_table(num_steps)
-        return self.run_chain(start, table, generator, text=text, guidance=guidance, eta=eta, hook=hook)
-
-    @torch.no_grad()
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
         observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
         eta: float = 1.0, hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D) from x_T, with observed entries kept.
-
-        Args:
-            x: x_T (B, N, D), or the scenes at step ``first``.
-            table: the chain.
-            noises: one generator for all scenes, or one per scene; None for torch's own.
-            observed: entries that carry no noise.
-            text, guidance, eta, closed: arguments of :meth:`transition`.
-            resample: number of times that each step is taken, with noise added again in between.
-            hook: hook that is called at the last time that each step is taken.
-            first: step that the chain begins at.
-        """
+        """x_0 (B, N, D), as :meth:`ScenePrior.run_chain` describes it; observed entries carry no noise."""
         free = self.unconditional(len(x)) if text is None or guidance else None
         x = x if observed is None else observed.write(x)
         for step in range(first, len(table)):
@@ -421,7 +398,10 @@ class MixedPrior(ScenePrior):
             rounds = resample if after > 0 else 1
             for again in range(rounds):
                 if again:
-                    x = self._renoise(x, after, level, draw_noise(x, noises))
+                    noise = draw_noise(x, noises)  # for a sample of q(x_t | x_s), s = after < t = level
+                    pose = self.process.renoise(x[..., :POSE_FEATURES], after, level, noise[..., :POSE_FEATURES])
+                    rows = self.categories.transition(after, level).to(x)[state_of(x[..., POSE_FEATURES:])]
+                    x = self.clamp(self.with_states(pose, rows, noise))
                     x = x if observed is None else observed.write(x)
                 reverse: ReverseStep = self.transition(
                     x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta, closed=closed
@@ -431,31 +411,6 @@ class MixedPrior(ScenePrior):
                 x = reverse.from_noise(draw_noise(x, noises))
                 x = x if observed is None else observed.write(x)
         return x
-
-    def _renoise(self, x_s: Tensor, s: int, t: int, noise: Tensor) -> Tensor:
-        """A sample of q(x_t | x_s), s < t."""
-        pose = self.process.renoise(x_s[..., :POSE_FEATURES], s, t, noise[..., :POSE_FEATURES])
-        rows = self.categories.transition(s, t).to(x_s)[state_of(x_s[..., POSE_FEATURES:])]
-        return self.clamp(self.with_states(pose, rows, noise))
-
-    # -- inpainting -------------------------------------------------------------------------------
-
-    def regenerate(
-        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
-        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
-        start: Start | None = None,
-    ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is observed."""
-        text = None if prompts is None else self.encode_prompts(prompts)
-        observed = Observed(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
-        noise = draw_noise(observed.x, generators)
-        probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
-        x = self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
-        first, x = (0, x) if start is None else (start[0], start[1].to(x))
-        closed = self.closed_categories(batch, mask)
-        return self.run_chain(
-            x, table, generators, observed, text, guidance, resample, hook=hook, first=first, closed=closed
-        )
 
     # -- training ---------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ from agents.networks.registry import config_state
 from agents.networks.text import Text
 from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.files import StoredPrior, explained, read_stored, write_stored
-from agents.priors.guidance import Guide, Hook, Start, Watch, guidance_hook, physics_strength
+from agents.priors.guidance import Guide, Hook, Watch, guidance_hook, physics_strength
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.envs.settings import check_claim_guidance, check_physics_guidance
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -355,8 +355,16 @@ class ScenePrior(nn.Module, ABC):
         return StepTable.spaced(self.config.num_timesteps, num_steps)
 
     def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
-        """x_T (count, slots, D): standard normal with the known entries clamped."""
-        noise = torch.randn(count, slots, self.features, generator=generator, device=self._fixed.device)
+        """x_T (count, slots, D): standard normal, discrete categories from their distribution at T, known entries clamped.
+
+        The noise is drawn on the device of the weights.
+        """
+        return self.initial_from_noise(
+            torch.randn(count, slots, self.features, generator=generator, device=self._fixed.device)
+        )
+
+    def initial_from_noise(self, noise: Tensor) -> Tensor:
+        """x_T (B, N, D) from standard normal ``noise`` (B, N, D)."""
         return self.clamp(noise)
 
     @abstractmethod
@@ -433,15 +441,34 @@ class ScenePrior(nn.Module, ABC):
     ) -> Tensor:  # fmt: skip
         """``count`` denoised scenes x_0 (count, slots, D), normalised, from one batch; arguments as in :meth:`sample`.
 
-        ``hook`` is called at every step, before x_{t-1} is drawn. Priors that read prompts override the method.
+        ``hook`` is called at every step, before x_{t-1} is drawn.
         """
-        table = self.step_table(num_steps)
+        text = None if prompts is None else self.encode_prompts(prompts)
         x = self.initial(count, self.config.slots if slots is None else slots, generator)
-        for step in range(len(table)):
-            noise = torch.randn(x.shape, generator=generator, device=x.device)
-            reverse: ReverseStep = self.transition(x, step, table, eta=eta)
-            x = (reverse if hook is None else hook(step, x, reverse)).from_noise(noise)
-        return x
+        return self.run_chain(
+            x, self.step_table(num_steps), generator, text=text, guidance=guidance, eta=eta, hook=hook
+        )
+
+    @abstractmethod
+    def run_chain(
+        self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
+        observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
+        eta: float = 1.0, hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
+    ) -> Tensor:  # fmt: skip
+        """x_0 (B, N, D) from x_T, with observed entries kept. No gradient passes.
+
+        Args:
+            x: x_T (B, N, D), or the scenes at step ``first``.
+            table: the chain.
+            noises: one generator for all scenes, or one per scene; None for torch's own.
+            observed: entries that are kept.
+            text: tokens (B, L, W) and mask (B, L) of the prompts; None without.
+            guidance, eta: settings of :meth:`sample`.
+            resample: number of times that each step is taken, with noise added again in between.
+            hook: hook that is called at the last time that each step is taken.
+            first: step that the chain begins at.
+            closed: (B, K) bool, categories that slots that are not observed do not take.
+        """
 
     def sampling_hook(
         self, count: int, slots: int, num_steps: int, *, prompts: Sequence[str] | None = None,
@@ -518,10 +545,19 @@ class ScenePrior(nn.Module, ABC):
             return merge(batch, self.decode(x).to(batch.tensor.device), both)
 
         hook = guidance_hook(self, table, scenes, both[..., :1], prompts, claim_guidance, strength, guide, watch)
+        text = None if prompts is None else self.encode_prompts(prompts)
+        given, changed = batch.to(self.device), both.to(self.device)
+        observed = Observed(self.encode(given), ~changed[..., 0], ~changed[..., 1])
+        first, x = 0, self.initial_from_noise(draw_noise(observed.x, generators))
         begins = getattr(watch, "start", None)
         start = None if begins is None else begins(len(table))
-        given, open_entries = batch.to(self.device), both.to(self.device)
-        return scenes(self.regenerate(given, open_entries, table, generators, resample, prompts, guidance, hook, start))
+        if start is not None:
+            first, x = start[0], start[1].to(x)
+        closed = self.closed_categories(given, changed)
+        x = self.run_chain(
+            x, table, generators, observed, text, guidance, resample, hook=hook, first=first, closed=closed
+        )
+        return scenes(x)
 
     def _check_prompts(
         self, prompt: Prompt, guidance: float, claim_guidance: float, count: int, slots: int
@@ -598,14 +634,6 @@ class ScenePrior(nn.Module, ABC):
             num_steps=num_steps,
             seed=seed,
         )
-
-    @abstractmethod
-    def regenerate(
-        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
-        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
-        start: Start | None = None,
-    ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
 
     def closed_categories(self, batch: SceneBatch, mask: Tensor) -> Tensor:
         """(B, K) bool: categories that the slots under ``mask`` (B, N, 2) must not take.
