@@ -355,16 +355,12 @@ class ScenePrior(nn.Module, ABC):
         return StepTable.spaced(self.config.num_timesteps, num_steps)
 
     def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
-        """x_T (count, slots, D): standard normal, discrete categories from their distribution at T, known entries clamped.
-
-        The noise is drawn on the device of the weights.
-        """
-        return self.initial_from_noise(
-            torch.randn(count, slots, self.features, generator=generator, device=self._fixed.device)
-        )
+        """x_T (count, slots, D), see :meth:`initial_from_noise`; the generator is on the device of the weights."""
+        noise = torch.randn(count, slots, self.features, generator=generator, device=self._fixed.device)
+        return self.initial_from_noise(noise)
 
     def initial_from_noise(self, noise: Tensor) -> Tensor:
-        """x_T (B, N, D) from standard normal ``noise`` (B, N, D)."""
+        """x_T (B, N, D) from standard normal ``noise`` (B, N, D), known entries clamped."""
         return self.clamp(noise)
 
     @abstractmethod
@@ -380,6 +376,7 @@ class ScenePrior(nn.Module, ABC):
         weight, std = self.process.estimate(int(table.timesteps[step]), int(table.previous[step]), self.residual)
         return weight, std[TRANSLATION].to(self.device)
 
+    @torch.no_grad()
     def sample(
         self, count: int, *, prompt: Prompt = None, guidance: float = 0.0,
         claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50,
@@ -413,7 +410,7 @@ class ScenePrior(nn.Module, ABC):
         wide = self.config.slots if slots is None else slots
         prompts = self._check_prompts(prompt, guidance, claim_guidance, count, wide)
         strength = physics_strength(physics_guidance, self.config, self.scene_type)
-        generator = Generator(str(self._fixed.device)).manual_seed(seed)
+        generator, table = Generator(str(self.device)).manual_seed(seed), self.step_table(num_steps)
         chunks = []
         for start in range(0, count, batch_size):
             texts = None if prompts is None else prompts[start : start + batch_size]
@@ -421,33 +418,10 @@ class ScenePrior(nn.Module, ABC):
             hook = self.sampling_hook(
                 size, wide, num_steps, prompts=texts, claim_guidance=claim_guidance, physics_guidance=strength
             )
-            x0 = self.sample_tensor(
-                size,
-                prompts=texts,
-                guidance=guidance,
-                num_steps=num_steps,
-                slots=slots,
-                generator=generator,
-                eta=eta,
-                hook=hook,
-            )
-            chunks.append(x0)
+            text = None if texts is None else self.encode_prompts(texts)
+            x = self.initial(size, wide, generator)
+            chunks.append(self.run_chain(x, table, generator, text=text, guidance=guidance, eta=eta, hook=hook))
         return self.decode(torch.cat(chunks))
-
-    @torch.no_grad()
-    def sample_tensor(
-        self, count: int, *, prompts: Sequence[str] | None = None, guidance: float = 0.0, num_steps: int = 50,
-        slots: int | None = None, generator: Generator | None = None, eta: float = 1.0, hook: Hook | None = None,
-    ) -> Tensor:  # fmt: skip
-        """``count`` denoised scenes x_0 (count, slots, D), normalised, from one batch; arguments as in :meth:`sample`.
-
-        ``hook`` is called at every step, before x_{t-1} is drawn.
-        """
-        text = None if prompts is None else self.encode_prompts(prompts)
-        x = self.initial(count, self.config.slots if slots is None else slots, generator)
-        return self.run_chain(
-            x, self.step_table(num_steps), generator, text=text, guidance=guidance, eta=eta, hook=hook
-        )
 
     @abstractmethod
     def run_chain(
