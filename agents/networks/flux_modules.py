@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -18,27 +18,6 @@ from torch.nn import functional as F
 
 Place = Literal["slots", "condition", "attention", "output"]
 """The part of the core after which the weights of a module are drawn, so that a seed keeps giving the same weights."""
-
-
-class FluxSizes(Protocol):
-    """The sizes of the core that modules are built for, as :class:`~agents.networks.MixedFluxConfig` describes them."""
-
-    @property
-    def categories(self) -> int: ...
-    @property
-    def hidden(self) -> int: ...
-    @property
-    def heads(self) -> int: ...
-    @property
-    def embedding(self) -> int: ...
-    @property
-    def text_width(self) -> int: ...
-    @property
-    def unit(self) -> tuple[float, float, float]: ...
-    @property
-    def blocks(self) -> int: ...
-    @property
-    def pair_width(self) -> int: ...
 
 
 @dataclass
@@ -130,6 +109,8 @@ class FluxModule(nn.Module):
 class ModuleConfig(ABC):
     """Configuration of a module; subclasses are frozen dataclasses whose fields go into files as they are.
 
+    Methods take the :class:`~agents.networks.MixedFluxConfig` of the network as ``core``.
+
     Attributes:
         name: name of the module, in files and as the first part of the names of its weights.
         place: after which part of the core its weights are drawn.
@@ -156,13 +137,13 @@ class ModuleConfig(ABC):
         """Number of features of a pair of slots that the module computes."""
         return 0
 
-    def text_tokens(self, core: FluxSizes) -> int:
+    def text_tokens(self, core: Any) -> int:
         """Number of leading text tokens that are for this module alone."""
         return 0
 
     @abstractmethod
-    def build(self, core: FluxSizes) -> FluxModule:
-        """The module with fresh weights, for a network of this configuration."""
+    def build(self, core: Any) -> FluxModule:
+        """The module with fresh weights, for a network with the configuration ``core``."""
 
 
 # -- observed entries -----------------------------------------------------------------------------
@@ -175,7 +156,7 @@ class ObservedFlagsConfig(ModuleConfig):
     name = "observed_flags"
     place = "slots"
 
-    def build(self, core: FluxSizes) -> ObservedFlags:
+    def build(self, core: Any) -> ObservedFlags:
         return ObservedFlags(core.embedding)
 
 
@@ -202,7 +183,7 @@ class PooledTextConfig(ModuleConfig):
     place = "condition"
     reads_text = True
 
-    def build(self, core: FluxSizes) -> PooledText:
+    def build(self, core: Any) -> PooledText:
         return PooledText(core.text_width, core.hidden)
 
 
@@ -227,7 +208,7 @@ class CountEmbeddingConfig(ModuleConfig):
     name = "count_embedding"
     place = "condition"
 
-    def build(self, core: FluxSizes) -> CountEmbedding:
+    def build(self, core: Any) -> CountEmbedding:
         return CountEmbedding(core.categories, core.text_width, core.hidden)
 
 
@@ -298,14 +279,14 @@ class CountConditioningConfig(ModuleConfig):
     def __post_init__(self) -> None:
         object.__setattr__(self, "kinds", tuple(self.kinds))  # a list, when it comes from JSON
 
-    def kinds_of(self, core: FluxSizes) -> tuple[int, ...]:
+    def kinds_of(self, core: Any) -> tuple[int, ...]:
         """The kind of each category."""
         return self.kinds or tuple(range(core.categories - 1))
 
-    def text_tokens(self, core: FluxSizes) -> int:
+    def text_tokens(self, core: Any) -> int:
         return max(self.kinds_of(core)) + 2
 
-    def build(self, core: FluxSizes) -> CountConditioning:
+    def build(self, core: Any) -> CountConditioning:
         return CountConditioning(self.kinds_of(core), core.text_width, core.hidden, self.largest)
 
 
@@ -440,7 +421,7 @@ class FourierFeaturesConfig(ModuleConfig):
     def pose_width(self) -> int:
         return 6 * self.octaves
 
-    def build(self, core: FluxSizes) -> FourierFeatures:
+    def build(self, core: Any) -> FourierFeatures:
         return FourierFeatures(self.octaves)
 
 

@@ -21,12 +21,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
+from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
 from scene_envs.errors import unknown_name
 from scene_envs.rotations import project_to_so3
 
@@ -55,7 +56,7 @@ class RotationFeaturesConfig(ModuleConfig):
     def pose_width(self) -> int:
         return ROTATION_FEATURES
 
-    def build(self, core: FluxSizes) -> RotationFeatures:
+    def build(self, core: Any) -> RotationFeatures:
         return RotationFeatures(core.embedding)
 
 
@@ -153,7 +154,7 @@ class RelationsConfig(ModuleConfig):
     def pair_width(self) -> int:
         return PAIR_FEATURES
 
-    def build(self, core: FluxSizes) -> Relations:
+    def build(self, core: Any) -> Relations:
         return Relations(core.blocks, core.heads, core.unit, blur=self.blur)
 
 
@@ -276,7 +277,7 @@ class ContactsConfig(ModuleConfig):
     reads_geometry = True
     reads_rotations = True
 
-    def build(self, core: FluxSizes) -> Contacts:
+    def build(self, core: Any) -> Contacts:
         return Contacts(core.categories, core.pair_width, core.hidden, core.embedding)
 
 
