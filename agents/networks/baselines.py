@@ -21,15 +21,17 @@ order of slots, although scenes have no order.
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.networks.flux import timestep_embedding
-from agents.networks.flux_modules import fourier_features
+from agents.networks.flux_modules import FourierFeatures
+from agents.networks.registry import register_network
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import POSE_FEATURES
 
@@ -53,8 +55,8 @@ class BaselineConfig:
     frequencies: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("hidden", "heads"):
-            if getattr(self, name) < 1:
+        for name in ("hidden", "heads", "depth", "levels", "blocks"):
+            if getattr(self, name, 1) < 1:
                 raise InvalidInputError(f"{name}={getattr(self, name)} is not positive")
         if self.hidden % self.heads:
             raise InvalidInputError(f"hidden={self.hidden} is not a multiple of heads={self.heads}")
@@ -126,34 +128,29 @@ class _Baseline(nn.Module):
         self.time_in = mlp(_TIME_WIDTH, hidden, hidden)
         self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None
         self.trunk = trunk
-        octaves = math.pi * 2.0 ** torch.arange(config.frequencies, dtype=torch.float32)
-        self.octaves: Tensor
-        self.register_buffer("octaves", octaves, persistent=False)
+        self.fourier = FourierFeatures(config.frequencies)
 
     def _tokens(self, tokens: Tensor, time: Tensor, text: Tensor | None, text_mask: Tensor | None) -> Tensor:
         """Tokens (B, N, H) through the trunk; ``time`` (B,)."""
         condition = self.time_in(timestep_embedding(time, _TIME_WIDTH).to(tokens.dtype))
         if self.text_in is None:
             return self.trunk(tokens, condition, None, None)
-        if text is None:
-            text, text_mask = tokens.new_zeros(len(tokens), 1, self.text_in.in_features), None
         mask = None
-        if text_mask is not None:
+        if text is None:
+            text = tokens.new_zeros(len(tokens), 1, self.text_in.in_features)
+        elif text_mask is not None:
             text = text * text_mask[..., None]
             somewhere = text_mask.any(dim=-1, keepdim=True)
             mask = (text_mask | ~somewhere)[:, None, None]  # a row of padding alone is read as no text
         return self.trunk(tokens, condition, self.text_in(text), mask)
 
     def _with_octaves(self, features: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor:
-        """Features (B, N, D), with Fourier features of the translations appended where the network has any.
-
-        The translations are the first three features of ``position``.
-        """
-        if not len(self.octaves):
+        """Features (B, N, D), with Fourier features of the translations appended where the network has any."""
+        if not self.config.frequencies:
             return features
         if position is None or noise_level is None:
             raise InvalidInputError("a network with Fourier features needs position= and noise_level=")
-        return torch.cat([features, fourier_features(position, noise_level, self.octaves)], dim=-1)
+        return torch.cat([features, self.fourier(position, noise_level)], dim=-1)
 
 
 class ContinuousBaseline(_Baseline):
@@ -218,11 +215,6 @@ class _MiDiffusionSize(BaselineConfig):
     depth: int = 6
     mlp_ratio: float = 4.0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.depth < 1:
-            raise InvalidInputError(f"depth={self.depth} is not positive")
-
 
 @dataclass(frozen=True, kw_only=True)
 class MiDiffusionConfig(_MiDiffusionSize):
@@ -280,7 +272,7 @@ class _Block(nn.Module):
 
 
 class _Transformer(nn.Module):
-    """The trunk: blocks, one after the other."""
+    """The trunk."""
 
     def __init__(self, config: _MiDiffusionSize) -> None:
         super().__init__()
@@ -328,12 +320,6 @@ class _DiffuSceneSize(BaselineConfig):
     levels: int = 4
     blocks: int = 2
     inner_ratio: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("levels", "blocks"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name}={getattr(self, name)} is not positive")
 
     @property
     def inner(self) -> int:
@@ -471,3 +457,22 @@ class MixedDiffuScene(MixedBaseline):
 
     def __init__(self, config: MixedDiffuSceneConfig) -> None:
         super().__init__(config, _UNet(config))
+
+
+# -- registration ---------------------------------------------------------------------------------
+
+
+def _midiffusion(keys: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: keys[name] for name in ("hidden", "depth", "heads", "text_width")}
+
+
+def _diffuscene(keys: Mapping[str, Any]) -> dict[str, Any]:
+    return {**{name: keys[name] for name in ("hidden", "heads", "text_width")}, "blocks": max(1, keys["depth"] // 3)}
+
+
+register_network("midiffusion", "continuous", MiDiffusionConfig, MiDiffusion, ratio="mlp_ratio", sizes=_midiffusion)
+register_network(
+    "midiffusion", "mixed", MixedMiDiffusionConfig, MixedMiDiffusion, ratio="mlp_ratio", sizes=_midiffusion
+)
+register_network("diffuscene", "continuous", DiffuSceneConfig, DiffuScene, ratio="inner_ratio", sizes=_diffuscene)
+register_network("diffuscene", "mixed", MixedDiffuSceneConfig, MixedDiffuScene, ratio="inner_ratio", sizes=_diffuscene)

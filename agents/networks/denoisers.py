@@ -79,9 +79,9 @@ class Observed:
         """(B, N) int64 as the network reads them: 1 where the pose is observed, plus 2 where the category is."""
         return self.pose.long() + 2 * self.category.long()
 
-    def entries(self) -> Tensor:
-        """(B, N, D) bool."""
-        is_pose = torch.arange(self.x.shape[-1], device=self.x.device) < POSE_FEATURES
+    def entries(self, pose_width: int = POSE_FEATURES) -> Tensor:
+        """(B, N, D) bool; the first ``pose_width`` numbers of a slot are its pose."""
+        is_pose = torch.arange(self.x.shape[-1], device=self.x.device) < pose_width
         return torch.where(is_pose, self.pose[..., None], self.category[..., None])
 
     def write(self, x: Tensor) -> Tensor:
@@ -101,8 +101,8 @@ class MixedDenoiser(nn.Module):
         network: nn.Module,
         poses: GaussianProcess,
         categories: CategoricalProcess,
-        text_encoder: TextEncoder | BertEncoder | None = None,
-        empty_slots: str = "attended",
+        text_encoder: TextEncoder | BertEncoder | None,
+        empty_slots: str,
     ) -> None:
         super().__init__()
         if empty_slots not in EMPTY_SLOTS:
@@ -141,7 +141,7 @@ class MixedDenoiser(nn.Module):
         return self._mean[t[:, None], states], self._std[t[:, None], states]
 
     def output(
-        self, x_t: Tensor, t: Tensor, observed: Observed | None = None, text: tuple[Tensor, Tensor] | None = None
+        self, x_t: Tensor, t: Tensor, observed: Observed | None = None, text: Text | None = None
     ) -> tuple[Tensor, Tensor]:
         """The raw pose output, in the units of ``poses.target``, and logits.
 
@@ -166,7 +166,9 @@ class MixedDenoiser(nn.Module):
         inputs = [scaled, states, position, level, *([] if observed is None else [observed.flags()])]
         if self.drops_empty:
             output, logits = self._on_present(inputs, time, text)
-            return output, torch.where((states < self.categories.categories)[..., None], self._certain(states), logits)
+            count = self.categories.categories
+            certain = _CERTAIN * (F.one_hot(states.clamp(max=count - 1), count).float() - 1.0)
+            return output, torch.where((states < count)[..., None], certain, logits)
         return self._run(inputs, time, text)
 
     def _run(
@@ -190,17 +192,12 @@ class MixedDenoiser(nn.Module):
         def run(rows: Tensor, index: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
             words = None if text is None else (text[0][rows], text[1][rows])
             attended = mask | ~mask.any(dim=1, keepdim=True)  # a scene of padding alone attends to it, unused
-            return self._run([take_slots(x, rows, index) for x in inputs], time[rows], words, attended)
+            return self._run([x[rows[:, None], index] for x in inputs], time[rows], words, attended)
 
         return run_packed(present, run, (POSE_FEATURES, self.categories.categories))
 
-    def _certain(self, states: Tensor) -> Tensor:
-        """(B, N, K) logits that are certain of the category that a state shows."""
-        count = self.categories.categories
-        return _CERTAIN * (F.one_hot(states.clamp(max=count - 1), count).float() - 1.0)
-
     def forward(
-        self, x_t: Tensor, t: Tensor, observed: Observed | None = None, text: tuple[Tensor, Tensor] | None = None
+        self, x_t: Tensor, t: Tensor, observed: Observed | None = None, text: Text | None = None
     ) -> tuple[Tensor, Tensor]:
         """The clean pose (B, N, 12), normalised, and the logits of the clean category (B, N, K)."""
         output, logits = self.output(x_t, t, observed, text)
@@ -244,24 +241,14 @@ def run_packed(
         run: function of rows, index and mask of :func:`pack` that gives two tensors (b, M, W).
         widths: W of the two outputs.
     """
-    parts, order = [], []
+    parts: list[list[Tensor]] = []
+    order: list[Tensor] = []
     for rows, index, mask in pack(active):
         order.append(rows)
-        parts.append(
-            [_spread(part * mask[..., None], index, active.shape[1], width)
-             for part, width in zip(run(rows, index, mask), widths, strict=True)]
-        )  # fmt: skip
+        parts.append([])
+        for values, width in zip(run(rows, index, mask), widths, strict=True):
+            blank = values.new_zeros(len(values), active.shape[1], width)
+            parts[-1].append(blank.scatter(1, index[..., None].expand(-1, -1, width), values * mask[..., None]))
     back = torch.argsort(torch.cat(order))
-    first, second = (torch.cat([part[side] for part in parts])[back] for side in (0, 1))
+    first, second = (torch.cat(side)[back] for side in zip(*parts, strict=True))
     return first, second
-
-
-def take_slots(x: Tensor, rows: Tensor, index: Tensor) -> Tensor:
-    """(b, M, ...) slots ``index`` (b, M) of the scenes ``rows`` of x (B, N, ...)."""
-    return x[rows[:, None], index]
-
-
-def _spread(values: Tensor, index: Tensor, slots: int, width: int) -> Tensor:
-    """(b, slots, width) with ``values`` (b, M, width) at ``index``."""
-    empty = values.new_zeros(len(values), slots, width)
-    return empty.scatter(1, index[..., None].expand(-1, -1, width), values)

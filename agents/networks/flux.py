@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, ClassVar
 
 import torch
@@ -23,13 +23,13 @@ from agents.networks.flux_modules import (
     CountConditioningConfig,
     CountEmbeddingConfig,
     FluxModule,
+    FourierFeatures,
     FourierFeaturesConfig,
     ModuleConfig,
     ObservedFlagsConfig,
     Place,
     PooledTextConfig,
     Scene,
-    fourier_features,
 )
 from agents.networks.geometry import (
     ContactsConfig,
@@ -38,6 +38,7 @@ from agents.networks.geometry import (
     joint_attention,
     nearest_rotations,
 )
+from agents.networks.registry import register_network
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import POSE_FEATURES
 
@@ -180,11 +181,11 @@ class FluxConfig:
             raise InvalidInputError(f"hidden={self.hidden} is not a multiple of heads={self.heads}")
 
 
-def timestep_embedding(value: Tensor, width: int, max_period: float = 10_000.0) -> Tensor:
+def timestep_embedding(value: Tensor, width: int) -> Tensor:
     """Sinusoidal embedding (B, width) of ``value`` (B,), cosines first."""
     half = width // 2
     value = value if value.is_floating_point() else value.float()
-    frequency = torch.exp(-math.log(max_period) * torch.arange(half, device=value.device, dtype=value.dtype) / half)
+    frequency = torch.exp(-math.log(10_000.0) * torch.arange(half, device=value.device, dtype=value.dtype) / half)
     angle = value[:, None] * frequency[None]
     return torch.cat([angle.cos(), angle.sin()], dim=-1)
 
@@ -216,9 +217,7 @@ class FluxDenoiser(nn.Module):
         for layer in (self.final_modulation, self.out):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
-        octaves = math.pi * 2.0 ** torch.arange(config.frequencies, dtype=torch.float32)
-        self.octaves: Tensor
-        self.register_buffer("octaves", octaves, persistent=False)
+        self.fourier = FourierFeatures(config.frequencies)
 
     def forward(self, x: Tensor, position: Tensor, noise_level: Tensor) -> Tensor:
         """Predict.
@@ -228,9 +227,7 @@ class FluxDenoiser(nn.Module):
             position: (B, N, D) the scene in signal units, x_t / alpha_t; its first three features are read.
             noise_level: (B,) noise-to-signal ratio of ``position``.
         """
-        features = x
-        if self.config.frequencies:
-            features = torch.cat([x, fourier_features(position, noise_level[:, None], self.octaves)], dim=-1)
+        features = torch.cat([x, self.fourier(position, noise_level[:, None])], dim=-1)
         condition = self.time_in(timestep_embedding(250.0 * noise_level.log(), 128))
         tokens = self.scene_in(features)
         for block in self.blocks:
@@ -340,6 +337,10 @@ class MixedFluxConfig:
         """Features of a pair of slots, of all modules."""
         return sum(module.pair_width for module in self.modules)
 
+    def state(self) -> dict[str, Any]:
+        """The fields for a file, the names of the modules among theirs."""
+        return {**asdict(self), "modules": [{"name": module.name, **vars(module)} for module in self.modules]}
+
     def without(self, *names: str) -> MixedFluxConfig:
         """The same network without some modules, which is an ablation.
 
@@ -351,11 +352,6 @@ class MixedFluxConfig:
             if name not in present:
                 raise unknown_name("module of the network", name, present)
         return replace(self, modules=tuple(module for module in self.modules if module.name not in names))
-
-
-def module_states(config: MixedFluxConfig) -> list[dict[str, Any]]:
-    """The modules for a file: their names and fields."""
-    return [{"name": module.name, **vars(module)} for module in config.modules]
 
 
 def make_module(entry: ModuleConfig | Mapping[str, Any]) -> ModuleConfig:
@@ -459,7 +455,9 @@ class MixedFlux(nn.Module):
         tokens = self.scene_in(slots)
         biases = self._relate(scene)
         tokens = self._add(tokens, lambda module: module.messages(scene))
-        tokens = self._attend(tokens, self._words(text, pose), condition, text_mask, biases, scene)
+        text = pose.new_zeros(len(pose), 1, self.config.text_width) if text is None else text
+        words = None if self.text_in is None else self.text_in(text)
+        tokens = self._attend(tokens, words, condition, text_mask, biases, scene)
         shift, scale = self.final_modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
         features = self.final((1 + scale) * F.layer_norm(tokens, (self.config.hidden,), eps=1e-6) + shift)
         logits = self._add(self.logits_out(features), lambda module: module.logits(scene))
@@ -498,11 +496,6 @@ class MixedFlux(nn.Module):
             slots = block(slots, condition, _add_bias(next(biases), mask, count), scene.pairs)
         return slots[:, count:]
 
-    def _words(self, text: Tensor | None, pose: Tensor) -> Tensor | None:
-        if self.text_in is None:
-            return None
-        return self.text_in(pose.new_zeros(len(pose), 1, self.config.text_width) if text is None else text)
-
     # -- modules ----------------------------------------------------------------------------------
 
     def _build_modules(self, place: Place) -> None:
@@ -522,10 +515,7 @@ class MixedFlux(nn.Module):
         return value
 
     def _take_text(self, scene: Scene, text: Tensor | None, mask: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        """The tokens that are not for single modules, with their mask.
-
-        Puts the leading tokens of modules, and the mean of the other tokens, into ``scene``.
-        """
+        """The tokens after those of single modules, with their mask; puts theirs, and the mean, into ``scene``."""
         if text is None:
             return None, mask
         for module in self.config.modules:
@@ -533,15 +523,15 @@ class MixedFlux(nn.Module):
             if count:
                 scene.own_text[module.name], text = text[:, :count], text[:, count:]
                 mask = None if mask is None else mask[:, count:]
-        scene.summary = _mean_token(text, mask)
+        if mask is None:
+            scene.summary = text.mean(dim=1)
+        else:
+            real = mask[..., None].to(text)
+            scene.summary = (text * real).sum(dim=1) / real.sum(dim=1).clamp(min=1.0)
         return text, mask
 
     def _read_geometry(self, scene: Scene, position: Tensor | None, noise_level: Tensor | None) -> None:
-        """Put translations in metres, rotations, and the noise on them into ``scene``, where modules read them.
-
-        Raises:
-            InvalidInputError: a module reads geometry, and none is given.
-        """
+        """Put translations in metres, rotations, and the noise on them into ``scene``, where modules read them."""
         readers = [module.name for module in self.config.modules if module.reads_geometry]
         if not readers:
             return
@@ -566,14 +556,6 @@ class MixedFlux(nn.Module):
         return iter(biases[0] if len(biases) == 1 else torch.stack(biases).sum(dim=0))
 
 
-def _mean_token(text: Tensor, mask: Tensor | None) -> Tensor:
-    """(B, W) mean of the tokens (B, L, W) that are not padding."""
-    if mask is None:
-        return text.mean(dim=1)
-    real = mask[..., None].to(text)
-    return (text * real).sum(dim=1) / real.sum(dim=1).clamp(min=1.0)
-
-
 def _where_to_attend(text_mask: Tensor | None, slot_mask: Tensor | None, count: int, slots: Tensor) -> Tensor | None:
     """(B, 1, 1, L + N) bool over ``count`` = L text tokens, then N slots; None where nothing is masked."""
     if text_mask is None and slot_mask is None:
@@ -590,3 +572,31 @@ def _add_bias(bias: Tensor | None, mask: Tensor | None, count: int) -> Tensor | 
         return mask
     bias = F.pad(bias, (count, 0, count, 0)) if count else bias
     return bias if mask is None else bias.masked_fill(~mask, -torch.inf)
+
+
+# -- registration ---------------------------------------------------------------------------------
+
+
+def _continuous_sizes(keys: Mapping[str, Any]) -> dict[str, Any]:
+    if keys["text_width"]:
+        raise InvalidInputError(f"text_width={keys['text_width']}: the continuous flux network reads no text; use 0")
+    return {name: keys[name] for name in ("hidden", "depth", "heads", "frequencies")}
+
+
+def _mixed_sizes(keys: Mapping[str, Any]) -> dict[str, Any]:
+    core = ("hidden", "heads", "text_width", "text_reach", "pose_head", "time_scale", "unit", "rotations")
+    chosen = keys["modules"] if keys["modules"] is not None else [ObservedFlagsConfig()]
+    octaves = keys["frequencies"]
+    modules = [make_module(entry) for entry in chosen] + ([FourierFeaturesConfig(octaves)] if octaves else [])
+    return {
+        **{name: keys[name] for name in core},
+        "double_blocks": max(1, keys["depth"] // 3) if keys["double_blocks"] is None else keys["double_blocks"],
+        "single_blocks": keys["depth"],
+        "embedding": keys["hidden"] if keys["embedding"] is None else keys["embedding"],
+        "time_input": "log_noise" if octaves else "timestep",
+        "modules": tuple(sorted(modules, key=lambda module: list(MODULES).index(module.name))),
+    }
+
+
+register_network("flux", "continuous", FluxConfig, FluxDenoiser, ratio="mlp_ratio", sizes=_continuous_sizes)
+register_network("flux", "mixed", MixedFluxConfig, MixedFlux, ratio="mlp_ratio", sizes=_mixed_sizes)

@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -18,27 +18,6 @@ from torch.nn import functional as F
 
 Place = Literal["slots", "condition", "attention", "output"]
 """The part of the core after which the weights of a module are drawn, so that a seed keeps giving the same weights."""
-
-
-class FluxSizes(Protocol):
-    """The sizes of the core that modules are built for, as :class:`~agents.networks.MixedFluxConfig` describes them."""
-
-    @property
-    def categories(self) -> int: ...
-    @property
-    def hidden(self) -> int: ...
-    @property
-    def heads(self) -> int: ...
-    @property
-    def embedding(self) -> int: ...
-    @property
-    def text_width(self) -> int: ...
-    @property
-    def unit(self) -> tuple[float, float, float]: ...
-    @property
-    def blocks(self) -> int: ...
-    @property
-    def pair_width(self) -> int: ...
 
 
 @dataclass
@@ -130,6 +109,8 @@ class FluxModule(nn.Module):
 class ModuleConfig(ABC):
     """Configuration of a module; subclasses are frozen dataclasses whose fields go into files as they are.
 
+    Methods take the :class:`~agents.networks.MixedFluxConfig` of the network as ``core``.
+
     Attributes:
         name: name of the module, in files and as the first part of the names of its weights.
         place: after which part of the core its weights are drawn.
@@ -156,13 +137,13 @@ class ModuleConfig(ABC):
         """Number of features of a pair of slots that the module computes."""
         return 0
 
-    def text_tokens(self, core: FluxSizes) -> int:
+    def text_tokens(self, core: Any) -> int:
         """Number of leading text tokens that are for this module alone."""
         return 0
 
     @abstractmethod
-    def build(self, core: FluxSizes) -> FluxModule:
-        """The module with fresh weights, for a network of this configuration."""
+    def build(self, core: Any) -> FluxModule:
+        """The module with fresh weights, for a network with the configuration ``core``."""
 
 
 # -- observed entries -----------------------------------------------------------------------------
@@ -175,7 +156,7 @@ class ObservedFlagsConfig(ModuleConfig):
     name = "observed_flags"
     place = "slots"
 
-    def build(self, core: FluxSizes) -> ObservedFlags:
+    def build(self, core: Any) -> ObservedFlags:
         return ObservedFlags(core.embedding)
 
 
@@ -188,9 +169,7 @@ class ObservedFlags(FluxModule):
         nn.init.zeros_(self.embedding.weight)
 
     def slot_features(self, scene: Scene) -> Tensor | None:
-        if scene.observed is None:
-            return None
-        return self.embedding(scene.observed)
+        return None if scene.observed is None else self.embedding(scene.observed)
 
 
 # -- text -----------------------------------------------------------------------------------------
@@ -204,7 +183,7 @@ class PooledTextConfig(ModuleConfig):
     place = "condition"
     reads_text = True
 
-    def build(self, core: FluxSizes) -> PooledText:
+    def build(self, core: Any) -> PooledText:
         return PooledText(core.text_width, core.hidden)
 
 
@@ -216,9 +195,7 @@ class PooledText(FluxModule):
         self.linear = nn.Linear(text_width, hidden, bias=False)
 
     def condition(self, scene: Scene) -> Tensor | None:
-        if scene.summary is None:
-            return None
-        return self.linear(scene.summary)
+        return None if scene.summary is None else self.linear(scene.summary)
 
 
 # -- counts ---------------------------------------------------------------------------------------
@@ -231,7 +208,7 @@ class CountEmbeddingConfig(ModuleConfig):
     name = "count_embedding"
     place = "condition"
 
-    def build(self, core: FluxSizes) -> CountEmbedding:
+    def build(self, core: Any) -> CountEmbedding:
         return CountEmbedding(core.categories, core.text_width, core.hidden)
 
 
@@ -256,17 +233,7 @@ def count_states(states: Tensor, categories: int, slot_mask: Tensor | None = Non
 
 
 class CountEmbedding(FluxModule):
-    """Counts of visible slots and the mean text token, to one vector (B, H) that is added to the condition.
-
-    Args:
-        categories: K = C + 1.
-        text_width: width of the text tokens; 0 for none.
-        hidden: H.
-
-    >>> count_embedding = CountEmbedding(categories=8, text_width=16, hidden=32)
-    >>> count_embedding(torch.randint(9, (2, 5)), torch.randn(2, 16)).shape
-    torch.Size([2, 32])
-    """
+    """Counts of visible slots and the mean text token (zeros without text), to one vector (B, H)."""
 
     def __init__(self, categories: int, text_width: int, hidden: int) -> None:
         super().__init__()
@@ -276,14 +243,11 @@ class CountEmbedding(FluxModule):
         )
 
     def condition(self, scene: Scene) -> Tensor | None:
-        return self(scene.states, scene.summary, scene.slot_mask)
-
-    def forward(self, states: Tensor, text: Tensor | None = None, slot_mask: Tensor | None = None) -> Tensor:
-        """Embed the numbers of :func:`count_states` with ``text`` (B, W), the mean text token; zeros when None."""
-        counts = count_states(states, self.categories, slot_mask).to(next(self.parameters()).dtype)
+        counts = count_states(scene.states, self.categories, scene.slot_mask).to(next(self.parameters()).dtype)
         inputs = [counts / 8.0, counts.log1p()]
         if self.text_width:
-            inputs.append(counts.new_zeros(len(counts), self.text_width) if text is None else text)
+            nothing = counts.new_zeros(len(counts), self.text_width)
+            inputs.append(nothing if scene.summary is None else scene.summary)
         return self.layers(torch.cat(inputs, dim=1))
 
 
@@ -315,14 +279,14 @@ class CountConditioningConfig(ModuleConfig):
     def __post_init__(self) -> None:
         object.__setattr__(self, "kinds", tuple(self.kinds))  # a list, when it comes from JSON
 
-    def kinds_of(self, core: FluxSizes) -> tuple[int, ...]:
+    def kinds_of(self, core: Any) -> tuple[int, ...]:
         """The kind of each category."""
         return self.kinds or tuple(range(core.categories - 1))
 
-    def text_tokens(self, core: FluxSizes) -> int:
+    def text_tokens(self, core: Any) -> int:
         return max(self.kinds_of(core)) + 2
 
-    def build(self, core: FluxSizes) -> CountConditioning:
+    def build(self, core: Any) -> CountConditioning:
         return CountConditioning(self.kinds_of(core), core.text_width, core.hidden, self.largest)
 
 
@@ -377,9 +341,7 @@ class CountConditioning(FluxModule):
 
     def logits(self, scene: Scene) -> Tensor | None:
         tokens = scene.own_text.get(CountConditioningConfig.name)
-        if tokens is None:
-            return None
-        return self(scene.states, tokens, scene.slot_mask)[:, None]
+        return None if tokens is None else self(scene.states, tokens, scene.slot_mask)[:, None]
 
     def forward(self, states: Tensor, tokens: Tensor, slot_mask: Tensor | None = None) -> Tensor:
         """Logits (B, K).
@@ -459,7 +421,7 @@ class FourierFeaturesConfig(ModuleConfig):
     def pose_width(self) -> int:
         return 6 * self.octaves
 
-    def build(self, core: FluxSizes) -> FourierFeatures:
+    def build(self, core: Any) -> FourierFeatures:
         return FourierFeatures(self.octaves)
 
 
@@ -478,14 +440,10 @@ class FourierFeatures(FluxModule):
     def pose_features(self, scene: Scene) -> Tensor | None:
         if scene.position is None or scene.noise_level is None:
             return None
-        return fourier_features(scene.position, scene.noise_level, self.octaves)
+        return self(scene.position, scene.noise_level)
 
-
-def fourier_features(position: Tensor, noise_level: Tensor, octaves: Tensor) -> Tensor:
-    """(B, N, 6 F) features of translations under noise (B, N).
-
-    The translations are the first three features of ``position`` (B, N, D).
-    """
-    angle = position[..., :3, None] * octaves  # (B, N, 3, F)
-    damping = torch.exp(-0.5 * (octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
-    return torch.cat([(angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)
+    def forward(self, position: Tensor, noise_level: Tensor) -> Tensor:
+        """Features of the first three numbers of ``position`` (B, N, D) under noise (B, N)."""
+        angle = position[..., :3, None] * self.octaves  # (B, N, 3, F)
+        damping = torch.exp(-0.5 * (self.octaves * noise_level[..., None]) ** 2).unsqueeze(-2)  # (B, N, 1, F)
+        return torch.cat([(angle.sin() * damping).flatten(-2), (angle.cos() * damping).flatten(-2)], dim=-1)

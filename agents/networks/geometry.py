@@ -21,12 +21,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.flux_modules import FluxModule, FluxSizes, ModuleConfig, Scene
+from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
 from scene_envs.errors import unknown_name
 from scene_envs.rotations import project_to_so3
 
@@ -55,12 +56,16 @@ class RotationFeaturesConfig(ModuleConfig):
     def pose_width(self) -> int:
         return ROTATION_FEATURES
 
-    def build(self, core: FluxSizes) -> RotationFeatures:
+    def build(self, core: Any) -> RotationFeatures:
         return RotationFeatures(core.embedding)
 
 
 class RotationFeatures(FluxModule):
-    """Features (B, N, :data:`ROTATION_FEATURES`) of rotations, and gates on them that start at zero."""
+    """Features (B, N, :data:`ROTATION_FEATURES`) of rotations, and gates on them that start at zero.
+
+    With gates from the features to the output, the blocks need not carry thirteen noisy numbers for every object. The
+    network only has to predict which features count, and this depends on the category and on where the object lies.
+    """
 
     def __init__(self, embedding: int) -> None:
         super().__init__()
@@ -71,14 +76,16 @@ class RotationFeatures(FluxModule):
     def pose_features(self, scene: Scene) -> Tensor | None:
         if scene.noisy_rotation is None or scene.rotation is None or scene.rotation_noise is None:
             return None
-        scene.kept[RotationFeaturesConfig.name] = rotation_features(
-            scene.noisy_rotation, scene.rotation, scene.rotation_noise
-        )
-        return scene.kept[RotationFeaturesConfig.name]
+        turns = rotation_features(scene.noisy_rotation, scene.rotation, scene.rotation_noise)
+        scene.kept[RotationFeaturesConfig.name] = turns
+        return turns
 
     def pose_output(self, scene: Scene, features: Tensor) -> Tensor | None:
         turns = scene.kept.get(RotationFeaturesConfig.name)
-        return None if turns is None else F.pad(gated_rotation(turns, self.gates(features)), (3, 0))
+        if turns is None:
+            return None
+        off, tilt = (turns * self.gates(features)).split([9, 4], dim=-1)
+        return F.pad(off.index_add(-1, torch.tensor(_TILTS, device=off.device), tilt), (3, 0))
 
 
 @torch.no_grad()
@@ -113,23 +120,14 @@ def rotation_features(rotation: Tensor, nearest: Tensor, noise: Tensor) -> Tenso
     return torch.cat([off, tilt / (level.square() + (tilt / _TILT_REACH).square()).sqrt()], dim=-1)
 
 
-def gated_rotation(features: Tensor, gates: Tensor) -> Tensor:
-    """Contribution of features (B, N, F) to the nine outputs of a rotation, each with a gate (B, N, F) of its own.
-
-    If the features had to pass through the blocks, the blocks would have to carry thirteen noisy numbers for every
-    object. With gates, the network only has to predict which features count. This depends on the category and on where
-    the object lies.
-    """
-    off, tilt = (features * gates).split([9, 4], dim=-1)
-    return off.index_add(-1, torch.tensor(_TILTS, device=off.device), tilt)
-
-
 # -- relations between slots ----------------------------------------------------------------------
 
 
 _SCALES = 8
 PAIR_FEATURES = 5 * _SCALES
 """Numbers per pair of slots."""
+_PAIR_WIDTH = 32
+"""Width of the networks on pairs."""
 BLURS = ("axis", "largest")
 """The noise that blurs the features of an axis: that of the axis itself, or the largest of all axes."""
 
@@ -156,7 +154,7 @@ class RelationsConfig(ModuleConfig):
     def pair_width(self) -> int:
         return PAIR_FEATURES
 
-    def build(self, core: FluxSizes) -> Relations:
+    def build(self, core: Any) -> Relations:
         return Relations(core.blocks, core.heads, core.unit, blur=self.blur)
 
 
@@ -192,7 +190,6 @@ class Relations(FluxModule):
         blocks: attention blocks.
         heads: heads per block.
         unit: metres per normalised unit along x, y, z; 0 along an axis that never varies.
-        width: hidden width.
         blur: the noise that blurs features of an axis: ``"axis"`` for the noise of the axis itself, ``"largest"`` for
             the largest noise of all axes, which is too large for heights in rooms.
 
@@ -202,28 +199,23 @@ class Relations(FluxModule):
     (torch.Size([2, 3, 4, 5, 5]), torch.Size([3, 5, 5, 40]))
     """
 
-    def __init__(
-        self, blocks: int, heads: int, unit: tuple[float, float, float], width: int = 32, blur: str = "axis"
-    ) -> None:
+    def __init__(self, blocks: int, heads: int, unit: tuple[float, float, float], blur: str = "axis") -> None:
         super().__init__()
-        if blur not in BLURS:
-            raise unknown_name("blur", blur, BLURS)
         self.blocks, self.heads, self.blur = blocks, heads, blur
         largest = torch.tensor(max(*unit, 0.1))
         self.unit: Tensor
         self.scales: Tensor
         self.register_buffer("unit", torch.tensor(unit), persistent=False)
         self.register_buffer("scales", torch.logspace(-2, float(largest.log10()), _SCALES), persistent=False)
-        self.hidden = nn.Linear(3 * _SCALES, width)
-        self.out = nn.Linear(width, blocks * heads)
+        self.hidden = nn.Linear(3 * _SCALES, _PAIR_WIDTH)
+        self.out = nn.Linear(_PAIR_WIDTH, blocks * heads)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
     def relations(self, scene: Scene) -> tuple[Tensor, Tensor] | None:
         if scene.position is None or scene.noise_level is None:
             return None
-        biases, features = self(scene.position[..., :3], scene.noise_level)
-        return biases, features
+        return self(scene.position[..., :3], scene.noise_level)  # type: ignore[no-any-return]
 
     def forward(self, position: Tensor, noise_level: Tensor) -> tuple[Tensor, Tensor]:
         """Biases (blocks, B, heads, N, N) and features (B, N, N, :data:`PAIR_FEATURES`).
@@ -240,12 +232,7 @@ class Relations(FluxModule):
 
 
 def joint_attention(
-    query: Tensor,
-    key: Tensor,
-    value: Tensor,
-    mask: Tensor | None = None,
-    relations: Tensor | None = None,
-    gathered: nn.Linear | None = None,
+    query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, relations: Tensor | None, gathered: nn.Linear | None
 ) -> Tensor:
     """Attention over T tokens, (B, T, H), plus a linear map of ``relations``, summed with the attention weights.
 
@@ -290,7 +277,7 @@ class ContactsConfig(ModuleConfig):
     reads_geometry = True
     reads_rotations = True
 
-    def build(self, core: FluxSizes) -> Contacts:
+    def build(self, core: Any) -> Contacts:
         return Contacts(core.categories, core.pair_width, core.hidden, core.embedding)
 
 
@@ -314,8 +301,6 @@ class Contacts(FluxModule):
         features: numbers per pair of slots, from :class:`~agents.networks.geometry.Relations`.
         hidden: width of the messages.
         embedding: width of the features from which the gates of the displacements are computed.
-        width: width of the networks on pairs.
-        kind: width of the embedding of a category.
 
     >>> contacts = Contacts(categories=3, features=40, hidden=16, embedding=16)
     >>> metres, rotation = torch.randn(2, 5, 3), torch.eye(3).expand(2, 5, 3, 3)
@@ -325,10 +310,9 @@ class Contacts(FluxModule):
     (torch.Size([2, 5, 16]), torch.Size([2, 5, 4, 3]))
     """
 
-    def __init__(
-        self, categories: int, features: int, hidden: int, embedding: int, width: int = 32, kind: int = 16
-    ) -> None:
+    def __init__(self, categories: int, features: int, hidden: int, embedding: int) -> None:
         super().__init__()
+        width, kind = _PAIR_WIDTH, 16
         self.kind = nn.Embedding(categories + 1, kind)
         self.seen = nn.Linear(features + 2 * _DIRECTIONS, width)
         self.own, self.other = (nn.Linear(kind, 2 * width, bias=False) for _ in range(2))
@@ -385,15 +369,18 @@ class Contacts(FluxModule):
         aside = toward * sign[..., :1]
         kinds = self.kind(states)
         early, late = (self.own(kinds).unsqueeze(2) + self.other(kinds).unsqueeze(1)).chunk(2, dim=-1)
-        seen = F.silu(self.seen(torch.cat([features, *_as_seen(aside, rotation)], dim=-1)) + early)
+        here = aside @ rotation[..., :2, :]  # the direction from j to i in the frame of i, and from i to j in that of j
+        there = -torch.einsum("bijw,bjwk->bijk", aside, rotation[..., :2, :])
+        pair = torch.cat([features, here, here.square(), there, there.square()], dim=-1)
+        seen = F.silu(self.seen(pair) + early)
         gaps = (along.abs() - _TYPICAL * (1.0 + self.touch(seen))) / both
         bounded = gaps / (1.0 + (gaps / _GAP_REACH).square()).sqrt()
         basis = [bounded, torch.sigmoid(-2.0 * gaps), torch.exp(-0.5 * gaps.square()), both[..., :1].log()]
         weighed = F.silu(self.weigh(torch.cat([seen, *basis], dim=-1)) + late)
         weighed = F.silu(self.second(weighed))
-        there = (~torch.eye(states.shape[1], dtype=torch.bool, device=states.device))[None].to(weighed)
-        there = (there if slot_mask is None else there * slot_mask.unsqueeze(1)).unsqueeze(-1)
-        weighed = torch.cat([weighed * there, there.expand(*weighed.shape[:-1], 1)], dim=-1)  # (B, N, N, W + 1)
+        others_only = (~torch.eye(states.shape[1], dtype=torch.bool, device=states.device))[None].to(weighed)
+        present = (others_only if slot_mask is None else others_only * slot_mask.unsqueeze(1)).unsqueeze(-1)
+        weighed = torch.cat([weighed * present, present.expand(*weighed.shape[:-1], 1)], dim=-1)  # (B, N, N, W + 1)
         sign = sign / both
         ways = [aside / both[..., :1], sign[..., 1:5], (sign[..., 5:, None] * rotation.mT.unsqueeze(1)).flatten(-2)]
         moves = self._displacements(weighed, torch.cat(ways, dim=-1), bounded, rotation)
@@ -417,21 +404,5 @@ class Contacts(FluxModule):
 
 
 def gated_displacement(displacements: Tensor, gates: Tensor) -> Tensor:
-    """Contribution (B, N, 3) of displacements (B, N, :data:`CHANNELS`, 3) to the translation output.
-
-    Args:
-        displacements: displacements that :class:`Contacts` returns.
-        gates: (B, N, CHANNELS * 3), one for each entry of the displacements.
-    """
+    """Contribution (B, N, 3) of displacements (B, N, C, 3) to the translation output, with gates (B, N, C * 3)."""
     return (displacements * gates.unflatten(-1, (CHANNELS, 3))).sum(dim=-2)
-
-
-def _as_seen(aside: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
-    """Horizontal directions in the frames of i and of j, with their squares, (B, N, N, 6) each.
-
-    The first is from j to i in the frame of i, the second from i to j in the frame of j; ``aside`` (B, N, N, 2) is from
-    j to i in the world.
-    """
-    first = aside @ rotation[..., :2, :]
-    second = -torch.einsum("bijw,bjwk->bijk", aside, rotation[..., :2, :])
-    return torch.cat([first, first.square()], dim=-1), torch.cat([second, second.square()], dim=-1)

@@ -11,26 +11,6 @@ import torch
 from torch import nn
 
 from agents.configuration.composition import check_types
-from agents.networks.baselines import (
-    DiffuScene,
-    DiffuSceneConfig,
-    MiDiffusion,
-    MiDiffusionConfig,
-    MixedDiffuScene,
-    MixedDiffuSceneConfig,
-    MixedMiDiffusion,
-    MixedMiDiffusionConfig,
-)
-from agents.networks.flux import (
-    MODULES,
-    FluxConfig,
-    FluxDenoiser,
-    MixedFlux,
-    MixedFluxConfig,
-    make_module,
-    module_states,
-)
-from agents.networks.flux_modules import FourierFeaturesConfig, ModuleConfig, ObservedFlagsConfig
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.registry import load_plugins
 
@@ -41,21 +21,13 @@ NETWORK_PROCESSES = ("continuous", "mixed")
 ENTRY_POINT_GROUP = "scene_envs.networks"
 """Entry points of installed packages: modules that call :func:`register_network` when they are imported."""
 
-ContinuousNetworkConfig = FluxConfig | MiDiffusionConfig | DiffuSceneConfig
-MixedNetworkConfig = MixedFluxConfig | MixedMiDiffusionConfig | MixedDiffuSceneConfig
-NetworkConfig = ContinuousNetworkConfig | MixedNetworkConfig
+NetworkConfig = Any
+"""The configuration of a network: a frozen dataclass that was registered with it."""
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """Entry of a network in the registry.
-
-    Attributes:
-        config: class of its configuration, a frozen dataclass.
-        network: builds a network with fresh weights from a configuration.
-        ratio: the field besides ``hidden`` that :func:`match_parameters` adjusts; None where there is none.
-        sizes: maps the keys of :func:`network_config` to fields of the configuration.
-    """
+    """The arguments of :func:`register_network`."""
 
     config: type[Any]
     network: Callable[[Any], nn.Module]
@@ -85,7 +57,8 @@ def register_network(
             ``features`` (continuous), and ``text_width`` where it reads text.
         network: function from such a configuration to a module, which keeps it as ``config``.
         ratio: the field besides ``hidden`` that :func:`match_parameters` adjusts.
-        sizes: function from the keys of :func:`network_config` to fields of ``config``; None takes the same keys.
+        sizes: function from the keys of :func:`network_config` to fields of ``config`` besides ``categories`` or
+            ``features``; None takes the same keys.
 
     Raises:
         UnknownNameError: no process has that name.
@@ -119,6 +92,7 @@ def build_network(config: NetworkConfig) -> nn.Module:
     Raises:
         InvalidInputError: ``config`` is not the configuration of a network.
 
+    >>> from agents.networks import MiDiffusionConfig
     >>> type(build_network(MiDiffusionConfig(features=20, hidden=32, depth=1))).__name__
     'MiDiffusion'
     """
@@ -129,7 +103,7 @@ def network_config(
     name: str, process: str, *, features: int, categories: int, hidden: int, depth: int, heads: int,
     text_width: int = 0, frequencies: int = 8, double_blocks: int | None = None, embedding: int | None = None,
     pose_head: int = 64, time_scale: float = 1.0, text_reach: str = "all",
-    modules: Sequence[ModuleConfig | Mapping[str, Any]] | None = None,
+    modules: Sequence[Any] | None = None,
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0),
     rotations: tuple[tuple[float, ...], tuple[float, ...]] = ((1.0,) * 9, (0.0,) * 9),
 ) -> NetworkConfig:  # fmt: skip
@@ -151,8 +125,9 @@ def network_config(
         embedding: width of the slots of the mixed ``flux``; None for ``hidden``.
         pose_head, time_scale, text_reach, unit, rotations: read by the mixed ``flux`` alone, see
             :class:`~agents.networks.MixedFluxConfig`.
-        modules: modules of the mixed ``flux``, without the Fourier features, which ``frequencies`` adds. All are put
-            in the order of :data:`~agents.networks.flux.MODULES`. None for the flags of inpainting alone.
+        modules: modules of the mixed ``flux``, as :class:`~agents.networks.MixedFluxConfig` takes them, without the
+            Fourier features, which ``frequencies`` adds. All are put in the order of
+            :data:`~agents.networks.flux.MODULES`. None for the flags of inpainting alone.
 
     Raises:
         UnknownNameError: no network or no process has that name.
@@ -163,19 +138,20 @@ def network_config(
     """
     keys = {key: value for key, value in locals().items() if key not in ("name", "process")}
     entry = _entry(name, process)
-    return entry.config(**entry.sizes(keys))
+    width = {"categories": categories} if process == "mixed" else {"features": features}
+    return entry.config(**{**width, **entry.sizes(keys)})
 
 
 def config_state(config: NetworkConfig) -> dict[str, Any]:
     """The fields of a configuration and its ``kind``, for a file.
 
+    >>> from agents.networks import FluxConfig
     >>> config_state(FluxConfig(features=20))["kind"]
     'flux'
     """
     entry = _entry_of(config)
     (name,) = [name for (name, _), known in _ENTRIES.items() if known is entry]
-    state = {"kind": name, **asdict(config)}
-    return {**state, "modules": module_states(config)} if isinstance(config, MixedFluxConfig) else state
+    return {"kind": name, **(config.state() if hasattr(config, "state") else asdict(config))}
 
 
 def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
@@ -212,11 +188,6 @@ def _entry(name: str, process: str) -> _Entry:
     return _ENTRIES[name, process]
 
 
-def ratio_name(name: str, process: str) -> str | None:
-    """The field besides ``hidden`` that :func:`match_parameters` adjusts; None where there is none."""
-    return _entry(name, process).ratio
-
-
 def _entry_of(config: Any) -> _Entry:
     found = [entry for entry in _ENTRIES.values() if entry.config is type(config)]
     if not found:
@@ -225,62 +196,11 @@ def _entry_of(config: Any) -> _Entry:
     return found[0]
 
 
-# -- the networks of this package ---------------------------------------------------------------
-
-
-def _continuous_flux(keys: Mapping[str, Any]) -> dict[str, Any]:
-    if keys["text_width"]:
-        raise InvalidInputError(f"text_width={keys['text_width']}: the continuous flux network reads no text; use 0")
-    return {name: keys[name] for name in ("features", "hidden", "depth", "heads", "frequencies")}
-
-
-def _mixed_flux(keys: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of the Flux core, and its modules in the order of ``MODULES``."""
-    core = ("categories", "hidden", "heads", "text_width", "text_reach", "pose_head", "time_scale", "unit", "rotations")
-    chosen = keys["modules"] if keys["modules"] is not None else [ObservedFlagsConfig()]
-    octaves = keys["frequencies"]
-    modules = [make_module(entry) for entry in chosen] + ([FourierFeaturesConfig(octaves)] if octaves else [])
-    order = list(MODULES)
-    return {
-        **{name: keys[name] for name in core},
-        "double_blocks": max(1, keys["depth"] // 3) if keys["double_blocks"] is None else keys["double_blocks"],
-        "single_blocks": keys["depth"],
-        "embedding": keys["hidden"] if keys["embedding"] is None else keys["embedding"],
-        "time_input": "log_noise" if octaves else "timestep",
-        "modules": tuple(sorted(modules, key=lambda module: order.index(module.name))),
-    }
-
-
-def _midiffusion(features: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
-    return lambda keys: {name: keys[name] for name in (features, "hidden", "depth", "heads", "text_width")}
-
-
-def _diffuscene(features: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
-    return lambda keys: {
-        **{name: keys[name] for name in (features, "hidden", "heads", "text_width")},
-        "blocks": max(1, keys["depth"] // 3),
-    }
-
-
-for _arguments in (
-    ("flux", "continuous", FluxConfig, FluxDenoiser, "mlp_ratio", _continuous_flux),
-    ("flux", "mixed", MixedFluxConfig, MixedFlux, "mlp_ratio", _mixed_flux),
-    ("midiffusion", "continuous", MiDiffusionConfig, MiDiffusion, "mlp_ratio", _midiffusion("features")),
-    ("midiffusion", "mixed", MixedMiDiffusionConfig, MixedMiDiffusion, "mlp_ratio", _midiffusion("categories")),
-    ("diffuscene", "continuous", DiffuSceneConfig, DiffuScene, "inner_ratio", _diffuscene("features")),
-    ("diffuscene", "mixed", MixedDiffuSceneConfig, MixedDiffuScene, "inner_ratio", _diffuscene("categories")),
-):
-    register_network(*_arguments[:4], ratio=_arguments[4], sizes=_arguments[5])
-
-
-_RATIO_STEPS, _RATIO_STEP = 24, 1 / 64
-
-
 @lru_cache(maxsize=1024)
 def parameter_count(config: NetworkConfig) -> int:
     """Number of parameters of a network; leaves the random state unchanged.
 
-    >>> from agents.networks.flux import FluxConfig
+    >>> from agents.networks import FluxConfig
     >>> parameter_count(FluxConfig(features=20, hidden=96, depth=3, heads=4))
     466916
     """
@@ -310,7 +230,7 @@ def match_parameters(name: str, process: str, target: int, **sizes: Any) -> Netw
     >>> abs(parameter_count(theirs) / parameter_count(ours) - 1) < 0.03
     True
     """
-    ratio_field = ratio_name(name, process)
+    ratio_field = _entry(name, process).ratio
 
     def at_width(units: int) -> NetworkConfig:
         return network_config(name, process, hidden=units * sizes["heads"], **sizes)
@@ -318,8 +238,7 @@ def match_parameters(name: str, process: str, target: int, **sizes: Any) -> Netw
     def at_ratio(config: NetworkConfig, step: int) -> NetworkConfig:
         if ratio_field is None:
             return config
-        ratio = getattr(config, ratio_field) * (1 + step * _RATIO_STEP)
-        return replace(config, **{ratio_field: ratio})
+        return replace(config, **{ratio_field: getattr(config, ratio_field) * (1 + step / 64)})
 
     smallest = parameter_count(at_width(1))
     if target < smallest:
@@ -333,12 +252,9 @@ def match_parameters(name: str, process: str, target: int, **sizes: Any) -> Netw
     width = _last(1, highest, lambda units: parameter_count(at_width(units)) <= target)
     candidates: list[tuple[NetworkConfig, int]] = []
     for units in (width, width + 1):
-        step = _last(
-            -_RATIO_STEPS,
-            _RATIO_STEPS - 1,
-            lambda step, units=units: parameter_count(at_ratio(at_width(units), step)) <= target,  # type: ignore[misc]
-        )
-        candidates += [(at_ratio(at_width(units), near), abs(near)) for near in (step, step + 1, 0)]
+        config = at_width(units)
+        step = _last(-24, 23, lambda step, config=config: parameter_count(at_ratio(config, step)) <= target)  # type: ignore[misc]
+        candidates += [(at_ratio(config, near), abs(near)) for near in (step, step + 1, 0)]
 
     def distance(candidate: tuple[NetworkConfig, int]) -> tuple[float, int]:
         """Sort key: relative error of the count, where errors below 1 % count as 1 %, then change of the ratio."""

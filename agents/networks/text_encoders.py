@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError
@@ -36,15 +36,8 @@ FOLDER_VARIABLE = "SCENE_ENVS_BERT"
 _HUB_NAME = re.compile(r"[\w.-]+(/[\w.-]+)?")
 
 
-@dataclass(frozen=True, eq=False)
-class Bert:
-    """A loaded model.
-
-    Attributes:
-        model: ``transformers.BertModel``, frozen.
-        tokenizer: its tokenizer.
-        digest: SHA-256 of weights and vocabulary.
-    """
+class Bert(NamedTuple):
+    """A loaded model: a frozen ``transformers.BertModel``, its tokenizer, and the digest of weights and vocabulary."""
 
     model: Any
     tokenizer: Any
@@ -112,19 +105,6 @@ def _transformers() -> Any:
     return transformers
 
 
-def download_bert(model: str) -> None:
-    """Fetch a hub model into the local cache, unless it is there or ``model`` is a folder."""
-    _transformers()
-    from huggingface_hub import snapshot_download
-
-    if os.path.isdir(model):
-        return
-    try:
-        snapshot_download(model, allow_patterns=["*.json", "vocab.txt", "model.safetensors"])
-    except Exception as error:
-        _LOGGER.info("%s could not be downloaded (%s); the local cache is looked into", model, _first_line(error))
-
-
 def _not_at_hand(model: str, error: Exception) -> str:
     if os.path.isdir(model):
         return (
@@ -155,8 +135,6 @@ def _digest(model: nn.Module, tokenizer: Any) -> str:
 
 Row = tuple[int, ...]
 """The tokens of one prompt, without padding."""
-CACHED_PROMPTS = 4096
-"""Number of latest prompts whose hidden states are cached."""
 _TOGETHER = 64
 """Prompts encoded together on an accelerator; on CPU each is encoded alone, so that no result depends on others."""
 
@@ -196,8 +174,16 @@ class BertTextConfig:
             InvalidInputError: no such model at hand, or not a BERT.
         """
         name = os.path.abspath(model) if Path(model).is_dir() else str(model)
-        if download:
-            download_bert(name)
+        if download and not os.path.isdir(name):
+            _transformers()
+            from huggingface_hub import snapshot_download
+
+            try:
+                snapshot_download(name, allow_patterns=["*.json", "vocab.txt", "model.safetensors"])
+            except Exception as error:
+                _LOGGER.info(
+                    "%s could not be downloaded (%s); the local cache is looked into", name, _first_line(error)
+                )
         bert = load_bert(name)
         nothing = tuple(bert.tokenizer("")["input_ids"])
         settings = bert.model.config
@@ -211,16 +197,16 @@ class BertEncoder(nn.Module):
 
     Its only own tensor is ``nothing`` (2, W), the hidden states of the empty prompt ``""``. A prior's file holds this
     tensor and not BERT, so that the prior can be sampled without prompts where BERT is not at hand. Copies of a prior
-    share one BERT. The hidden states of the latest prompts are cached.
+    share one BERT.
 
     Args:
         config: configuration that names the BERT.
-        cached: number of prompts whose hidden states are cached.
+        cached: number of latest prompts whose hidden states are cached.
     """
 
     nothing: Tensor
 
-    def __init__(self, config: BertTextConfig, cached: int = CACHED_PROMPTS) -> None:
+    def __init__(self, config: BertTextConfig, cached: int = 4096) -> None:
         super().__init__()
         self.config = config
         self.cached = cached

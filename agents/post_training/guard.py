@@ -46,7 +46,7 @@ class Guard:
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior()
-    >>> guard = Guard(prior.sample_tensor(4, num_steps=2), limit=1.5, seed=0)
+    >>> guard = Guard(prior.encode(prior.sample(4, num_steps=2)), limit=1.5, seed=0)
     >>> guard.start(prior)
     >>> guard.check(prior, 10, reward=1.0).ratio
     1.0

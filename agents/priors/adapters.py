@@ -5,36 +5,17 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from torch import Tensor
 
-from agents.diffusion import Preconditioning
 from agents.priors.files import StoredPrior, read_stored
 from scene_envs.errors import InvalidInputError
-from scene_envs.normalizer import Normalizer
-from scene_envs.scene_types import SceneType
 
 AdapterSpec = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 """A run folder or a prior; several joined by ``+``, or in a list; each may have a factor before ``*``."""
-
-
-class Adaptable(Protocol):
-    """Interface of a prior that adapters use; :class:`~agents.priors.prior.ScenePrior` has it."""
-
-    scene_type: SceneType
-    process_name: str
-    normalizer: Normalizer
-    preconditioning: Preconditioning
-    card: dict[str, Any]
-
-    def weights(self) -> dict[str, Tensor]:
-        """Trained tensors by name."""
-
-    def load_weights(self, tensors: dict[str, Tensor]) -> None:
-        """Inverse of :meth:`weights`."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +50,13 @@ def parse_adapters(spec: AdapterSpec) -> list[AdapterTerm]:
     return terms
 
 
-def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) -> None:
-    """Add the updates of adapters to the weights of a prior.
+def merge_adapters(base: StoredPrior, name: str, terms: Sequence[AdapterTerm]) -> StoredPrior:
+    """A prior with the updates of adapters added to its weights.
 
-    The update of a fine-tuned prior is its weights minus those of ``prior`` (task arithmetic, Ilharco et al. 2023).
+    The update of a fine-tuned prior is its weights minus those of ``base`` (task arithmetic, Ilharco et al. 2023).
 
     Args:
-        prior: prior that is changed.
+        base: contents of the prior's files.
         name: name of the prior, for messages.
         terms: fine-tuned priors that were all trained from this prior.
 
@@ -84,38 +65,36 @@ def merge_adapters(prior: Adaptable, name: str, terms: Sequence[AdapterTerm]) ->
         CorruptFileError: the files of an adapter are not those of a prior.
     """
     read = [(term, read_stored(term.path)) for term in terms]
-    differences = [_difference(prior, name, term, stored) for term, stored in read]
-    weights = prior.weights()
-    prior.load_weights({key: value + sum(each[key] for each in differences) for key, value in weights.items()})
+    differences = [_difference(base, name, term, stored) for term, stored in read]
+    tensors = {key: value + sum(each[key] for each in differences) for key, value in base.tensors.items()}
+    kept = {key: value for key, value in base.card.items() if key not in ("measures", "limits")}
     parts = [part for term, stored in read for part in _runs(term, stored)]
-    kept = {key: value for key, value in prior.card.items() if key not in ("measures", "limits")}
-    prior.card = {**kept, "post_training": {"base": Path(name).name, "sum": parts}}
+    card = {**kept, "post_training": {"base": Path(name).name, "sum": parts}}
+    return replace(base, tensors=tensors, card=card)
 
 
-def _difference(prior: Adaptable, name: str, term: AdapterTerm, stored: StoredPrior) -> dict[str, Tensor]:
+def _difference(base: StoredPrior, name: str, term: AdapterTerm, stored: StoredPrior) -> dict[str, Tensor]:
     """Weights of a fine-tuned prior minus those of its base prior, times the factor of the term."""
-    weights, own = prior.weights(), Path(name).name
-    base = (stored.card.get("post_training") or {}).get("base", own)
-    shapes, others = ({key: tensor.shape for key, tensor in each.items()} for each in (weights, stored.tensors))
-    same = (stored.process, stored.scene_type.name, others) == (prior.process_name, prior.scene_type.name, shapes)
+    own = Path(name).name
+    trained_from = (stored.card.get("post_training") or {}).get("base", own)
+    first, second = (
+        (each.process, each.scene_type.name, {key: tensor.shape for key, tensor in each.tensors.items()})
+        for each in (stored, base)
+    )
+    units, base_units = ((each.normalizer.state(), each.preconditioning.state()) for each in (stored, base))
     origin = ""
-    if base != own:
-        origin = f"was trained from {base!r}"
-    elif not same:
+    if trained_from != own:
+        origin = f"was trained from {trained_from!r}"
+    elif first != second:
         origin = "has another network or scene type"
-    elif _moments(stored) != _moments(prior):
+    elif units != base_units:
         origin = "has another normalizer or preconditioning"
     if origin:
         raise InvalidInputError(
             f"adapter={str(term.path)!r}: this prior {origin}, so it cannot be added to {name!r}; give priors that "
             f"were trained from {name!r}, or load its own base prior with prior="
         )
-    return {key: term.factor * (stored.tensors[key].to(value) - value) for key, value in weights.items()}
-
-
-def _moments(prior: Adaptable | StoredPrior) -> tuple[dict[str, Any], dict[str, Any]]:
-    """State of the normalizer and of the preconditioning, in whose units the weights read and write poses."""
-    return prior.normalizer.state(), prior.preconditioning.state()
+    return {key: term.factor * (stored.tensors[key] - value) for key, value in base.tensors.items()}
 
 
 def _runs(term: AdapterTerm, stored: StoredPrior) -> list[dict[str, Any]]:

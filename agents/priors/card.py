@@ -57,9 +57,8 @@ def package_prior(
 
     _check_folder(Path(output))
 
-    measures = {} if evaluation is None else read_measures(evaluation)
+    measures, measured = ({}, None) if evaluation is None else read_measures(evaluation)
     prior = ScenePrior.load(source)
-    measured = None if evaluation is None else measured_digest(evaluation)
     if measured is not None and measured != prior_digest(prior):
         raise InvalidInputError(
             f"evaluation={str(evaluation)!r} has figures of other weights than those of the prior (digest {measured}, "
@@ -68,7 +67,8 @@ def package_prior(
     config = prior.config
     if physics_guidance is not None:
         prior.with_physics_guidance(physics_guidance)
-    given = {"data": data, "license": license or _license(prior.card), "machine": machine, "limits": limits}
+    known = str(prior.card.get("license") or ("" if "imported_from" in prior.card else OWN_LICENSE))
+    given = {"data": data, "license": license or known, "machine": machine, "limits": limits}
     kept = prior.card
     # the settings of a post-training run describe the post-training; the card has those of the pretraining
     steered = bool(kept.get("post_training"))
@@ -113,14 +113,8 @@ def prior_digest(prior: ScenePrior) -> str:
     return digest.hexdigest()[:16]
 
 
-def measured_digest(path: str | os.PathLike[str]) -> str | None:
-    """The digest of the prior that an evaluation measured; None for figures without one."""
-    identity = (_read_json(_metrics_file(path)).get("evaluation") or {}).get("identity") or {}
-    return identity.get("digest")
-
-
-def read_measures(path: str | os.PathLike[str]) -> dict[str, float]:
-    """The figures of ``scene-envs evaluate`` that are numbers.
+def read_measures(path: str | os.PathLike[str]) -> tuple[dict[str, float], str | None]:
+    """The figures of ``scene-envs evaluate`` that are numbers, and the digest of the prior that was measured, if any.
 
     Args:
         path: ``metrics.json``, or the folder it is in.
@@ -129,22 +123,32 @@ def read_measures(path: str | os.PathLike[str]) -> dict[str, float]:
         InvalidInputError: no such file, or no figure in it.
         CorruptFileError: not JSON.
     """
-    file = _metrics_file(path)
-    content = _read_json(file)
+    file = Path(path) / "metrics.json" if Path(path).is_dir() else Path(path)
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InvalidInputError(f"no evaluation at {str(file)!r}; scene-envs evaluate writes one") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CorruptFileError(f"{str(file)!r} is not valid JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise CorruptFileError(f"{str(file)!r} is not a metrics.json: it holds no mapping")
     figures = {
-        name: value for name, value in content.items() if isinstance(value, int | float) and not isinstance(value, bool)
+        name: float(value)
+        for name, value in content.items()
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     }
     if "scenes" not in figures:
         raise InvalidInputError(
             f"{str(file)!r} holds no figures of samples; give the metrics.json that scene-envs evaluate writes"
         )
-    return {name: float(value) for name, value in figures.items() if math.isfinite(value)}
+    return figures, ((content.get("evaluation") or {}).get("identity") or {}).get("digest")
 
 
 def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
     """The model card, Markdown."""
     card = facts.card
     kind = "A text-conditioned" if facts.text else "An unconditional"
+    prompt = " prompt='A scene with 12 objects.'" if facts.text else ""
     rows = {
         "scene type": f"{facts.scene_type}: {prior.scene_type.num_assets} assets, {facts.slots} slots",
         "network": _network(prior, facts),
@@ -166,12 +170,9 @@ def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
         "## What it is not good at",
         str(card.get("limits") or "Not stated."),
         "## Use",
-        f"```sh\nscene-envs sample prior={name}{_PROMPT if facts.text else ''} count=16 project=true\n```",
+        f"```sh\nscene-envs sample prior={name}{prompt} count=16 project=true\n```",
     ]
     return "\n\n".join(parts) + "\n"
-
-
-_PROMPT = " prompt='A scene with 12 objects.'"
 
 
 def _measured(prior: ScenePrior, measures: Mapping[str, float]) -> str:
@@ -206,10 +207,9 @@ def _network(prior: ScenePrior, facts: PriorFacts) -> str:
 
 
 def _process(prior: ScenePrior, facts: PriorFacts) -> str:
-    config = getattr(prior, "mixed", prior.config)
+    config = prior.config
     text = f"{facts.process}, T = {config.num_timesteps}, schedule {config.schedule}, prediction {config.prediction}"
-    kernel = getattr(config, "kernel", "")
-    return f"{text}, categories {kernel}" if kernel else text
+    return f"{text}, categories {config.kernel}" if hasattr(config, "kernel") else text
 
 
 def _sampling(prior: ScenePrior) -> str:
@@ -224,12 +224,13 @@ def _data(card: Mapping[str, Any]) -> str:
 
 
 def _training(card: Mapping[str, Any]) -> str:
-    run = card.get("training") or {}
+    run, base = card.get("training") or {}, card.get("base") or {}
+    base_steps = f" ({base['trained_steps']:,} steps)" if base.get("trained_steps") else ""
     parts = [
         f"{card['trained_steps']:,} steps" + (f" of {card['batch_size']} scenes" if card.get("batch_size") else "")
         if "trained_steps" in card
         else "",
-        _further(card.get("base") or {}),
+        f"from `{base['name']}`{base_steps}" if base.get("name") else "",
         _OPTIMIZERS.get(run.get("optimizer", ""), ""),
         f"peak learning rate {run['learning_rate']:g}, EMA {run['ema']:g}" if "learning_rate" in run else "",
         f"{card['seconds'] / 60:.0f} minutes" if card.get("seconds") else "",
@@ -238,12 +239,6 @@ def _training(card: Mapping[str, Any]) -> str:
         f"imported from {card['imported_from']}" if "imported_from" in card else "",
     ]
     return ", ".join(part.rstrip(".") for part in parts if part)
-
-
-def _further(base: Mapping[str, Any]) -> str:
-    """Base prior of a further pretraining."""
-    steps = f" ({base['trained_steps']:,} steps)" if base.get("trained_steps") else ""
-    return f"from `{base['name']}`{steps}" if base.get("name") else ""
 
 
 def _post_training(card: Mapping[str, Any]) -> str:
@@ -292,23 +287,3 @@ def _without_folders(state: dict[str, Any]) -> dict[str, Any]:
     if not text or not os.path.isabs(text.get("model", "")):
         return state
     return {**state, "prior": {**state["prior"], "text": {**text, "model": os.path.basename(text["model"])}}}
-
-
-def _metrics_file(path: str | os.PathLike[str]) -> Path:
-    return Path(path) / "metrics.json" if Path(path).is_dir() else Path(path)
-
-
-def _read_json(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InvalidInputError(f"no evaluation at {str(file)!r}; scene-envs evaluate writes one") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CorruptFileError(f"{str(file)!r} is not valid JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise CorruptFileError(f"{str(file)!r} is not a metrics.json: it holds no mapping")
-    return content
-
-
-def _license(card: Mapping[str, Any]) -> str:
-    return str(card.get("license") or ("" if "imported_from" in card else OWN_LICENSE))

@@ -92,7 +92,7 @@ def import_checkpoint(
     info = read_metadata(Path(metadata))
     tensors = rename(checkpoint["state_dict"], file)
     config = sizes(tensors, file)
-    scene_type = scene_type_of(info, Path(file).stem) if scene is None else get_scene_type(scene)
+    scene_type = _scene_type_of(info, Path(file).stem) if scene is None else get_scene_type(scene)
     numbers = {config.categories - 1, len(info.model_paths), scene_type.num_assets}
     if len(numbers) > 1:
         raise InvalidInputError(
@@ -110,7 +110,7 @@ def import_checkpoint(
         prediction="epsilon",
         category_loss="bound",
         category_weight=1.0,
-        text=bert_of(config.text_width, text_encoder, file),
+        text=_bert_of(config.text_width, text_encoder, file),
         observed_share=0.0,
         clip=1.0,
     )
@@ -121,17 +121,8 @@ def import_checkpoint(
     return prior.eval()
 
 
-def bert_of(width: int, name: str, file: str | os.PathLike[str]) -> BertTextConfig | None:
-    """The BERT that a checkpoint reads prompts with; None for a prior without prompts.
-
-    Args:
-        width: width of the checkpoint's text tokens; 0 for none.
-        name: folder or hub name; empty for BERT-base, if it can be loaded without a download.
-        file: the checkpoint, for messages.
-
-    Raises:
-        MissingDependencyError, InvalidInputError: ``name`` is given and cannot be used.
-    """
+def _bert_of(width: int, name: str, file: str | os.PathLike[str]) -> BertTextConfig | None:
+    """The BERT for text tokens of a ``width``, as :func:`import_checkpoint` chooses it; None for no prompts."""
     if not width:
         if name:
             raise InvalidInputError(f"{str(file)!r} was trained without text; leave text_encoder={name!r} out")
@@ -155,11 +146,8 @@ def bert_of(width: int, name: str, file: str | os.PathLike[str]) -> BertTextConf
     return config
 
 
-def scene_type_of(info: DatasetInfo, name: str) -> SceneType:
-    """A scene type made only from a dataset's metadata, registered as ``name``.
-
-    Its workspace is the range of the normalizer. Its camera looks straight down on the workspace.
-    """
+def _scene_type_of(info: DatasetInfo, name: str) -> SceneType:
+    """A scene type from metadata alone, registered as ``name``; its workspace is the normalizer's, seen from above."""
     low, high = (tuple(float(v) for v in bound[:3]) for bound in (info.normalizer.input_min, info.normalizer.input_max))
     stems = dict(zip(info.model_paths, info.stems, strict=True))
     welded = tuple(stems[path] for path in info.welded_model_paths if path in stems)
@@ -255,8 +243,8 @@ def _fill(network: torch.nn.Module, tensors: dict[str, Tensor], file: str | os.P
         if name in tensors and tensors[name].shape != expected[name].shape
     ]
     if missing or extra or shapes:
-        parts = [f"{what}: {_list(names)}" for what, names in
-                 (("missing", missing), ("extra", extra), ("of another shape", shapes)) if names]  # fmt: skip
+        found = {"missing": missing, "extra": extra, "of another shape": shapes}
+        parts = [f"{what}: {_list(names)}" for what, names in found.items() if names]
         raise CorruptFileError(f"{str(file)!r} does not fit the mixed Flux model (our names); {'; '.join(parts)}")
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
 
@@ -280,15 +268,10 @@ def _list(names: list[str]) -> str:
 
 def _with_categories(normalizer: Normalizer, scene: SceneType) -> Normalizer:
     """The normalizer over all D features; the imported one covers poses, and may cover one-hots as well."""
-    low, high = (torch.zeros(scene.features), torch.ones(scene.features))
-    low[:POSE_FEATURES], high[:POSE_FEATURES] = (
-        normalizer.input_min[:POSE_FEATURES],
-        normalizer.input_max[:POSE_FEATURES],
-    )
-    whole = Normalizer.from_range(low, high)
-    scale, offset = whole.scale.clone(), whole.min.clone()
-    scale[:POSE_FEATURES], offset[:POSE_FEATURES] = normalizer.scale[:POSE_FEATURES], normalizer.min[:POSE_FEATURES]
-    return Normalizer(scale, offset, whole.input_min, whole.input_max)
+    flags = torch.ones(scene.features - POSE_FEATURES)
+    one_hot = Normalizer.from_range(0 * flags, flags)
+    names = ("scale", "min", "input_min", "input_max")
+    return Normalizer(*(torch.cat([getattr(normalizer, n)[:POSE_FEATURES], getattr(one_hot, n)]) for n in names))
 
 
 # -- files of PyTorch Lightning -------------------------------------------------------------------
@@ -324,20 +307,10 @@ class _Placeholder:
     def __init__(self, *_: Any, **__: Any) -> None:
         pass
 
-    def __setstate__(self, _: Any) -> None:
-        pass
-
     def __call__(self, *_: Any, **__: Any) -> _Placeholder:
         return self
 
-    def append(self, _: Any) -> None:
-        pass
-
-    def extend(self, _: Any) -> None:
-        pass
-
-    def __setitem__(self, _: Any, __: Any) -> None:
-        pass
+    append = extend = __setitem__ = __setstate__ = __init__
 
 
 _ALLOWED = {

@@ -6,8 +6,8 @@ Claims become linear constraints on pairs of objects: what stands on, in, next t
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -80,22 +80,16 @@ class ClaimGuidance:
         for row, (claims, scene) in enumerate(zip(self._claims, facts, strict=True)):
             if claims and scene.count:
                 wanted = constraints(claims, scene, _surfaces(batch, row, scene), error)
-                moves[row, scene.slots] = self._moves(wanted, scene, error, self._free(batch, row, scene)) @ self._axes
+                free = scene.slots >= len(batch.scene_type.fixed)
+                free = free if self._movable is None else free & self._movable[row, scene.slots]
+                moves[row, scene.slots] = self._moves(wanted, scene, error, free) @ self._axes
         return torch.as_tensor(moves, dtype=batch.tensor.dtype, device=std.device)
-
-    def _free(self, batch: SceneBatch, row: int, scene: SceneFacts) -> Mask:
-        """(n,) bool: objects that may move."""
-        free: Mask = scene.slots >= len(batch.scene_type.fixed)
-        return free if self._movable is None else free & self._movable[row, scene.slots]
 
     def _moves(self, wanted: Sequence[Constraint], scene: SceneFacts, error: Array, free: Mask) -> Array:
         """(n, 3) m, in the frame of ``scene``: the sum of the moves for M constraints."""
         if not wanted:
             return np.zeros((scene.count, 3))
-        first, second = (np.array([getattr(c, name) for c in wanted]) for name in ("first", "second"))
-        low, high = (np.array([getattr(c, name) for c in wanted]) for name in ("low", "high"))
-        stays = np.array([c.second_stays for c in wanted])
-        axis = np.stack([c.axis for c in wanted])  # (M, 3)
+        first, second, axis, low, high, stays = map(np.array, zip(*wanted, strict=True))  # axis (M, 3), others (M,)
         carried = _carried(scene)
         movers = [_without(carried, first, second) & free, _without(carried, second, first) & free]  # (M, n) each
         moved = np.stack([who.any(axis=1) for who in movers])  # (2, M)
@@ -219,9 +213,6 @@ def constraints(claims: Sequence[Claim], scene: SceneFacts, surfaces: Surfaces, 
     return found
 
 
-# -- references -------------------------------------------------------------------------------------
-
-
 def _refer(
     reference: Reference, scene: SceneFacts, surfaces: Surfaces, taken: int = -1
 ) -> tuple[int, list[Constraint]]:
@@ -261,9 +252,6 @@ def _direction(side: str) -> Array:
     """(3,) unit vector toward a side, in the axes right, front and up of positions."""
     axis, sign = {"left": (0, -1.0), "right": (0, 1.0), "front": (1, 1.0), "back": (1, -1.0)}[side]
     return sign * AXES[axis]
-
-
-# -- claims -----------------------------------------------------------------------------------------
 
 
 def _side(claim: SideClaim, scene: SceneFacts, surfaces: Surfaces, placed: Collection[str]) -> list[Constraint]:
@@ -337,9 +325,8 @@ def _place(claim: PlaceCount, scene: SceneFacts, surfaces: Surfaces) -> list[Con
     missing = claim.number - int(here.sum())
     height = scene.boxes[:, 0, 2] - scene.positions[unit, 2]
     if missing > 0:
-        distance = (
-            np.abs(height - levels[tier]) if tier is not None else distance_across(scene, np.arange(scene.count), unit)
-        )
+        across = distance_across(scene, np.arange(scene.count), unit)
+        distance = across if tier is None else np.abs(height - levels[tier])
         for index in sorted(members[~here], key=lambda index: distance[index])[:missing]:
             found += stands_at(int(index), unit, scene, None if tier is None else levels[tier])
     elif missing < 0 and tier is not None and len(levels) > 1:
@@ -352,9 +339,6 @@ def _place(claim: PlaceCount, scene: SceneFacts, surfaces: Surfaces) -> list[Con
         for index in sorted(members[here], key=lambda index: (index in bears, away[:, index].min()))[:-missing]:
             found += stands_at(int(index), int(units[away[:, index].argmin()]), scene, None)
     return found
-
-
-# -- supports ---------------------------------------------------------------------------------------
 
 
 def _likely_supports(
@@ -371,9 +355,8 @@ def _likely_supports(
     height = scene.boxes[:, 0, 2]
     for index in members[~np.isin(support_of[members], supports)]:
         above = height[index] - height
-        below: Mask = (
-            (distance_across(scene, index, np.arange(scene.count)) < reach) & (above > 0.0) & (above < _STOREY)
-        )
+        near = distance_across(scene, index, np.arange(scene.count)) < reach
+        below: Mask = near & (above > 0.0) & (above < _STOREY)
         below[index] = False
         if below.any():
             nearest = int(np.where(below, above, np.inf).argmin())
@@ -437,8 +420,7 @@ _OFF = 10.0
 """A place outside the furniture counts as less roomy by this factor times its distance."""
 
 
-@dataclass(frozen=True)
-class Constraint:
+class Constraint(NamedTuple):
     """``low <= axis . (position of first - position of second) <= high``, in the frame of :class:`SceneFacts`.
 
     Attributes:
@@ -456,8 +438,7 @@ class Constraint:
     second_stays: bool = False
 
 
-@dataclass(frozen=True)
-class Surfaces:
+class Surfaces(NamedTuple):
     """Heights of the surfaces of n objects that carry others, relative to the positions of :class:`SceneFacts`, m.
 
     Attributes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from agents.networks.registry import ContinuousNetworkConfig, MixedNetworkConfig, NetworkConfig
+from agents.networks.registry import NetworkConfig
 from agents.networks.text_encoders import AnyTextConfig
 
 PROCESSES = ("continuous", "mixed")
@@ -68,11 +68,9 @@ class PriorConfig(PoseDiffusionConfig, DenoiserConfig):
     Further fields are those of :class:`DenoiserConfig` and :class:`PoseDiffusionConfig`.
 
     Attributes:
-        network: kind and size of its denoiser, any configuration of a continuous network.
         rotation: representation of the rotations, ``"matrix"``, ``"quaternion"`` or ``"axis_angle"``.
     """
 
-    network: ContinuousNetworkConfig
     rotation: str = "matrix"
 
 
@@ -102,7 +100,6 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
             types have one member.
     """
 
-    network: MixedNetworkConfig
     timesteps: str = "lognormal"
     kernel: str = "mask_and_replace"
     category_loss: str = "cross_entropy"

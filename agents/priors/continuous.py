@@ -12,21 +12,16 @@ from typing import Any
 
 import torch
 from torch import Generator, Tensor
+from torch.nn import functional as F
 
 from agents.configuration.composition import check_types
-from agents.diffusion import GaussianProcess, GaussianStep, Preconditioning, ResidualVariance, ReverseStep, StepTable
-from agents.diffusion.gaussian import (
-    check_weighting,
-    loss_weights,
-    make_schedule,
-    timestep_distribution,
-    timestep_weights,
-)
-from agents.networks.denoisers import Denoiser
+from agents.diffusion import GaussianStep, Preconditioning, ResidualVariance, ReverseStep, StepTable
+from agents.diffusion.gaussian import loss_weights
+from agents.networks.denoisers import Denoiser, Observed
 from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import Text
 from agents.priors.config import PriorConfig
-from agents.priors.guidance import Hook, Start
+from agents.priors.guidance import Hook
 from agents.priors.prior import DenoiserOutput, NoisedScenes, ScenePrior, draw_noise, no_text
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
@@ -73,13 +68,8 @@ class ContinuousPrior(ScenePrior):
         super().__init__()
         self.code = SceneCode(get_scene_type(config.scene_type), config.rotation, normalizer)
         _check_network(config, self.code)
-        check_weighting(config.loss_weighting, config.prediction)
         self._keep(config, normalizer, preconditioning, card, residual)
-        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
-        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         self.denoiser = Denoiser(build_network(config.network), self.process)
-        distribution = timestep_distribution(config.timesteps, config.prediction)
-        self._timestep_weights = timestep_weights(distribution, schedule, config.noise_mean, config.noise_std)
 
     @classmethod
     def fitted(
@@ -101,18 +91,11 @@ class ContinuousPrior(ScenePrior):
         return cls(config, normalizer, fitted if moments == "feature" else fitted.pooled())
 
     @classmethod
-    def from_state(
-        cls,
-        fields: dict[str, Any],
-        normalizer: Normalizer,
-        preconditioning: Preconditioning,
-        card: dict[str, Any] | None,
-        residual: ResidualVariance | None,
-    ) -> ContinuousPrior:
-        """From the ``prior`` entry of a configuration file."""
+    def config_from_state(cls, fields: dict[str, Any]) -> PriorConfig:
+        """The configuration in the ``prior`` entry of a file."""
         fields = {**fields, "network": config_from_state(fields["network"], "continuous")}
         check_types(PriorConfig, fields)
-        return cls(PriorConfig(**fields), normalizer, preconditioning, card, residual)
+        return PriorConfig(**fields)
 
     # -- scenes and numbers ---------------------------------------------------------------------
 
@@ -170,35 +153,34 @@ class ContinuousPrior(ScenePrior):
         std_map = std * (~self.known(x_t.shape[1])).to(x_t.dtype)
         return GaussianStep(self.clamp(mean), std_map, x0.detach())
 
-    def _entries(self, observed: Tensor) -> Tensor:
-        """(B, N, D) bool per feature, from (B, N, 2) bool for pose and category."""
-        widths = torch.tensor([self.pose_width, self.features - self.pose_width], device=observed.device)
-        return observed.repeat_interleave(widths, dim=-1)
-
-    def regenerate(
-        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
-        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
-        start: Start | None = None,
+    @torch.no_grad()
+    def run_chain(
+        self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
+        observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
+        eta: float = 1.0, hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
-        x0, keep = self.encode(batch), self._entries(~mask)
-        x = self.clamp(draw_noise(x0, generators))
-        first, x = (0, x) if start is None else (start[0], start[1].to(x))
+        """x_0 (B, N, D), as :meth:`ScenePrior.run_chain` describes it; there is no text, and ``guidance`` is not read.
+
+        Observed entries have the noise of each level. Closed categories leave the arg-max at the end.
+        """
+        kept = None if observed is None else observed.entries(self.pose_width)
         for step in range(first, len(table)):
             level, after = table.timesteps[step], int(table.previous[step])
             rounds = resample if after > 0 else 1
             for again in range(rounds):
                 if again:
-                    x = self.process.renoise(x, after, int(level), draw_noise(x0, generators))
-                noised = self.process.add_noise(x0, level, draw_noise(x0, generators))
-                x = self.clamp(torch.where(keep, noised, x))  # kept entries have the noise of this level
-                reverse: ReverseStep = self.transition(x, step, table)
+                    x = self.process.renoise(x, after, int(level), draw_noise(x, noises))
+                if observed is not None and kept is not None:
+                    noised = self.process.add_noise(observed.x, level, draw_noise(x, noises))
+                    x = self.clamp(torch.where(kept, noised, x))
+                reverse: ReverseStep = self.transition(x, step, table, eta=eta)
                 if hook is not None and again == rounds - 1:
                     reverse = hook(step, x, reverse)
-                x = reverse.from_noise(draw_noise(x0, generators))
-        closed = self.closed_categories(batch, mask)[:, None].expand(*x.shape[:2], -1)
-        x = x.masked_fill(torch.nn.functional.pad(closed, (self.pose_width, 0)), torch.finfo(x.dtype).min)
-        return torch.where(keep, x0, x)
+                x = reverse.from_noise(draw_noise(x, noises))
+        if closed is not None:
+            barred = F.pad(closed[:, None].expand(*x.shape[:2], -1), (self.pose_width, 0))
+            x = x.masked_fill(barred, torch.finfo(x.dtype).min)
+        return x if observed is None or kept is None else torch.where(kept, observed.x, x)
 
     def noised_loss(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
         """(B,) weighted mean squares of the network's error, over entries that are not known.
@@ -227,19 +209,10 @@ class ContinuousPrior(ScenePrior):
             raise no_text(self.scene_type, "")
         return DenoiserOutput(self.denoiser.output(noised.x_t, noised.t))
 
-    @torch.no_grad()
-    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
-        """Measure the denoiser's error on normalised scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
-        generator = Generator().manual_seed(seed)
-        timesteps = StepTable.spaced(self.config.num_timesteps, levels).timesteps.flip(0)
-        rows = []
-        for t in timesteps:
-            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
-            x_t = self.clamp(self.process.add_noise(x0, t, noise))
-            error = self.denoiser(x_t, t.to(x0.device).expand(len(x0))) - x0
-            rows.append(error[:, len(self.scene_type.fixed) :].square().mean(dim=(0, 1)).cpu())
-        self.residual = ResidualVariance(timesteps, torch.stack(rows))
-        return self.residual
+    def mean_square_error(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """(D,) error of every number of free slots, as :meth:`ScenePrior.mean_square_error` describes it."""
+        error = self.denoiser(self.clamp(self.process.add_noise(x0, t, noise)), t) - x0
+        return error[:, len(self.scene_type.fixed) :].square().mean(dim=(0, 1))
 
 
 def _check_network(config: PriorConfig, code: SceneCode) -> None:

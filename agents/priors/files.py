@@ -23,11 +23,17 @@ from scene_envs.files import read_tensors, with_digest, without_digest, write_js
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
 
+_LOGGER = logging.getLogger(__name__)
+
 WEIGHTS_NAME = "model.safetensors"
 RESIDUAL = "residual."
 """Prefix of the names of measured tensors, which are not weights."""
+_LEVELS, _VARIANCE = f"{RESIDUAL}timesteps", f"{RESIDUAL}variance"
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 """Number formats of the weights in a file."""
+ASSET_FOLDERS = "SCENE_ENVS_ASSET_FOLDERS"
+"""Environment variable with the folders of assets that priors from elsewhere may read."""
+_LIMITS = {"slots": 10_000, "num_timesteps": 1_000_000, "seed": 2**63}
 
 
 def to_precision(weights: Mapping[str, Tensor], precision: str) -> dict[str, Tensor]:
@@ -54,14 +60,6 @@ def to_precision(weights: Mapping[str, Tensor], precision: str) -> dict[str, Ten
                 f"{precision}; save the prior with precision='float32'"
             )
     return {name: tensor.to(kind) if tensor.is_floating_point() else tensor for name, tensor in weights.items()}
-
-
-def write_prior(directory: str | os.PathLike[str], config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Path:
-    """Write a prior's configuration and weights, each file atomically."""
-    directory = Path(directory)
-    write_tensors(directory / WEIGHTS_NAME, tensors)
-    write_config(directory, config)
-    return directory
 
 
 def write_config(directory: Path, config: Mapping[str, Any]) -> None:
@@ -121,14 +119,6 @@ def _weights_of(name: str | os.PathLike[str]) -> Iterator[Path]:
 # -- whole priors ---------------------------------------------------------------------------------
 
 
-logger = logging.getLogger(__name__)
-
-ASSET_FOLDERS = "SCENE_ENVS_ASSET_FOLDERS"
-"""Environment variable with the folders of assets that priors from elsewhere may read."""
-_LIMITS = {"slots": 10_000, "num_timesteps": 1_000_000, "seed": 2**63}
-_LEVELS, _RESIDUAL = "residual.timesteps", "residual.variance"
-
-
 @dataclass(frozen=True)
 class StoredPrior:
     """Contents of the files of a prior.
@@ -167,7 +157,7 @@ def read_stored(name: str | os.PathLike[str]) -> StoredPrior:
         return StoredPrior(
             preconditioning=Preconditioning.from_state(state["preconditioning"]),
             normalizer=Normalizer.from_state(state["normalizer_state"]),
-            residual=ResidualVariance(tensors.pop(_LEVELS), tensors.pop(_RESIDUAL)) if _LEVELS in tensors else None,
+            residual=ResidualVariance(tensors.pop(_LEVELS), tensors.pop(_VARIANCE)) if _LEVELS in tensors else None,
             scene_type=_known_scene_type(state, find_prior(name)),
             process=state["process"],
             fields=state["prior"],
@@ -189,20 +179,17 @@ def explained(name: str | os.PathLike[str]) -> Iterator[None]:
         raise
     except RuntimeError as error:
         raise CorruptFileError(
-            f"the weights of the prior {str(name)!r} do not fit its network: {_cut(error)}"
+            f"the weights of the prior {str(name)!r} do not fit its network: {str(error)[:500]}"
         ) from error
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise CorruptFileError(
-            f"the configuration of the prior {str(name)!r} is not one of ours: {type(error).__name__}: {_cut(error)}"
+            f"the configuration of the prior {str(name)!r} is not one of ours: {type(error).__name__}: "
+            f"{str(error)[:500]}"
         ) from error
 
 
-def _cut(error: BaseException) -> str:
-    return str(error)[:500]
-
-
 def write_stored(directory: str | os.PathLike[str], stored: StoredPrior, precision: str = "float32") -> Path:
-    """Write a prior's configuration and weights, the weights in ``precision`` (``"float32"`` or ``"float16"``)."""
+    """Write a prior's configuration, and its weights in ``precision`` (see :func:`to_precision`), each atomically."""
     state = {
         "process": stored.process,
         "prior": stored.fields,
@@ -213,8 +200,11 @@ def write_stored(directory: str | os.PathLike[str], stored: StoredPrior, precisi
     }
     tensors = to_precision(stored.tensors, precision)
     if stored.residual is not None:
-        tensors |= {_LEVELS: stored.residual.timesteps, _RESIDUAL: stored.residual.variance}
-    return write_prior(directory, state, tensors)
+        tensors |= {_LEVELS: stored.residual.timesteps, _VARIANCE: stored.residual.variance}
+    folder = Path(directory)
+    write_tensors(folder / WEIGHTS_NAME, tensors)
+    write_config(folder, state)
+    return folder
 
 
 def _known_scene_type(state: dict[str, Any], directory: Path) -> SceneType:
@@ -236,7 +226,7 @@ def _known_scene_type(state: dict[str, Any], directory: Path) -> SceneType:
         )
         left = [folder for folder in found.asset_folders if folder not in kept]
         if left:
-            logger.warning(
+            _LOGGER.warning(
                 "the prior %r names folders of assets outside its own, which are not read: %s; to read them, name "
                 "them in the environment variable %s, separated by %r",
                 str(directory),
@@ -248,15 +238,9 @@ def _known_scene_type(state: dict[str, Any], directory: Path) -> SceneType:
 
 
 def check_sizes(fields: Any, weights: int, name: str | os.PathLike[str]) -> None:
-    """Refuse a configuration that asks for a network larger than the weights in its file, before anything is built.
+    """Raise CorruptFileError if nested ``fields`` ask for a network larger than the number of ``weights`` in its file.
 
-    Args:
-        fields: the configuration, nested.
-        weights: number of weights in the file.
-        name: name of the prior, for the message.
-
-    Raises:
-        CorruptFileError: a size is out of proportion.
+    Nothing has been built by then.
     """
     sizes = list(_sizes(fields, ""))
     room = 64 * (weights + 100_000)
@@ -293,8 +277,6 @@ HEADLINES = {
     "novelty": "novelty",
 }
 """The figures of :mod:`agents.evaluation` that a listing shows, and their labels."""
-_RATIOS = ("novelty",)
-_FLOOR = "floor_"
 
 
 @dataclass(frozen=True)
@@ -370,11 +352,11 @@ def headlines(measures: Mapping[str, float]) -> list[tuple[str, str, str]]:
     >>> headlines({"feasible_fraction": 0.81, "floor_feasible_fraction": 0.99, "novelty": 0.954})
     [('free objects feasible as sampled', '81 %', '99 %'), ('novelty', '0.95', '')]
     """
-    rows = []
-    for name, label in HEADLINES.items():
-        if name in measures:
-            rows.append((label, _figure(name, measures[name]), _figure(name, measures.get(_FLOOR + name))))
-    return rows
+    return [
+        (label, _figure(name, measures[name]), _figure(name, measures.get(f"floor_{name}")))
+        for name, label in HEADLINES.items()
+        if name in measures
+    ]
 
 
 def _reader(text: Mapping[str, Any] | None) -> str:
@@ -388,4 +370,4 @@ def _reader(text: Mapping[str, Any] | None) -> str:
 def _figure(name: str, value: float | None) -> str:
     if value is None:
         return ""
-    return f"{value:.2f}" if name in _RATIOS else f"{100 * value:.3g} %"
+    return f"{value:.2f}" if name == "novelty" else f"{100 * value:.3g} %"

@@ -47,8 +47,6 @@ Guide = Callable[[int, int, Callable[[], SceneBatch], Tensor], Tensor | None]
 ``denoised`` is as for :data:`Watch`; ``std`` (3,) is the standard deviation of the denoised translations, m. If the
 shift is None, the step is not changed.
 """
-Draw = Callable[[Tensor, ReverseStep], ReverseStep]
-"""``(x_t, reverse) -> reverse``: changes how the categories of masked slots are drawn."""
 Watch = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
 """``(step, steps, denoised) -> rows``: called at the steps of the denoising; chooses the scenes that continue.
 
@@ -64,50 +62,10 @@ class Estimating(Protocol):
     """A prior, as far as hooks need it."""
 
     normalizer: Normalizer
+    scene_type: SceneType
 
     def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
         """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
-
-
-def make_hook(
-    prior: Estimating, table: StepTable, scenes: Callable[[Tensor], SceneBatch], moved: Tensor, *,
-    watch: Watch | None = None, guides: Sequence[Guide] = (), draw: Draw | None = None,
-) -> Hook | None:  # fmt: skip
-    """The hook of one chain; None if nothing watches or guides it.
-
-    Args:
-        prior: prior that denoises.
-        table: the chain.
-        scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
-        moved: (B, N, 1) bool, slots whose poses guides may move.
-        watch, guides, draw: callables, in the order ``watch.see``, ``draw``, guides, ``watch``.
-    """
-    see = getattr(watch, "see", None)
-
-    def hook(step: int, x: Tensor, reverse: ReverseStep) -> ReverseStep:
-        estimate = reverse.denoised
-        if see is not None:
-            see(step, len(table), x)
-        if draw is not None:
-            reverse = draw(x, reverse)
-        if estimate is None:
-            return reverse
-
-        def denoised() -> SceneBatch:
-            return scenes(estimate)
-
-        if guides:
-            weight, std = prior.estimate(step, table)
-            scale = prior.normalizer.scale[TRANSLATION].to(std)
-            metres = _in_metres(std, scale)
-        for guide in guides:
-            shift = guide(step, len(table), denoised, metres)
-            if shift is not None:
-                reverse = reverse.shifted(weight * scale * shift.to(std) * moved.to(std))
-        rows = None if watch is None else watch(step, len(table), denoised)
-        return reverse if rows is None else reverse.take(rows.to(x.device))
-
-    return None if watch is None and draw is None and not guides else hook
 
 
 def position_std(prior: Estimating, step: int, table: StepTable) -> Tensor:
@@ -326,16 +284,11 @@ def _of_reference(reference: Reference) -> Iterator[tuple[str, float, float]]:
     yield reference.name, max(2, reference.ordinal) if reference.ordinal else 1, 1 if only else math.inf
 
 
-# -- all together ---------------------------------------------------------------------------------
+# -- one hook of all guidance ---------------------------------------------------------------------
 
 
 def physics_strength(given: float | None, config: Any, scene_type: SceneType) -> float:
-    """Strength of physics guidance of a chain.
-
-    Args:
-        given: strength that the caller gives; None takes that of the prior.
-        config: configuration of the prior.
-        scene_type: scene type of the scenes.
+    """The strength that a caller gives, or else that of a prior's configuration.
 
     Raises:
         InvalidInputError: not from 0 to 1, or the assets have no geometry.
@@ -346,30 +299,61 @@ def physics_strength(given: float | None, config: Any, scene_type: SceneType) ->
 
 
 def guidance_hook(
-    prior: Estimating, scene_type: SceneType, table: StepTable, scenes: Callable[[Tensor], SceneBatch], moved: Tensor,
-    *, prompts: Sequence[str] | None = None, claim_guidance: float = 0.0, physics_guidance: float = 0.0,
-    guide: Guide | None = None, watch: Watch | None = None,
-) -> Hook | None:  # fmt: skip
+    prior: Estimating,
+    table: StepTable,
+    scenes: Callable[[Tensor], SceneBatch],
+    moved: Tensor,
+    prompts: Sequence[str] | None,
+    claim_guidance: float,
+    physics_guidance: float,
+    guide: Guide | None = None,
+    watch: Watch | None = None,
+) -> Hook | None:
     """The hook of one chain under guidance; None if nothing watches or guides it.
+
+    At a step it calls ``watch.see``, number guidance, ``guide``, claim guidance, physics guidance, and ``watch``.
 
     Args:
         prior: prior that denoises.
-        scene_type: scene type of the scenes.
         table: the chain.
         scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
         moved: (B, N, 1) bool, slots whose poses are denoised.
         prompts: one per scene; without prompts there is no claim guidance.
         claim_guidance: strength, 0 for none.
         physics_guidance: strength, 0 for none.
-        guide: guide that is called before the others.
-        watch: watch that is called at the end of each step.
+        guide, watch: callables of the caller.
     """
     movable = moved.squeeze(-1)
     guides: list[Guide] = [] if guide is None else [guide]
-    numbers = None
+    draw = None
     if prompts is not None and claim_guidance:
-        guides.append(ClaimGuidance(prompts, scene_type, claim_guidance, movable))
-        numbers = NumberGuidance(prompts, scene_type)
+        guides.append(ClaimGuidance(prompts, prior.scene_type, claim_guidance, movable))
+        draw = NumberGuidance(prompts, prior.scene_type)
     if physics_guidance:
         guides.append(PhysicsGuidance(physics_guidance, movable))
-    return make_hook(prior, table, scenes, moved, watch=watch, guides=guides, draw=numbers)
+    see = getattr(watch, "see", None)
+
+    def hook(step: int, x: Tensor, reverse: ReverseStep) -> ReverseStep:
+        estimate = reverse.denoised
+        if see is not None:
+            see(step, len(table), x)
+        if draw is not None:
+            reverse = draw(x, reverse)
+        if estimate is None:
+            return reverse
+
+        def denoised() -> SceneBatch:
+            return scenes(estimate)
+
+        if guides:
+            weight, std = prior.estimate(step, table)
+            scale = prior.normalizer.scale[TRANSLATION].to(std)
+            metres = _in_metres(std, scale)
+        for each in guides:
+            shift = each(step, len(table), denoised, metres)
+            if shift is not None:
+                reverse = reverse.shifted(weight * scale * shift.to(std) * moved.to(std))
+        rows = None if watch is None else watch(step, len(table), denoised)
+        return reverse if rows is None else reverse.take(rows.to(x.device))
+
+    return None if watch is None and draw is None and not guides else hook

@@ -16,16 +16,9 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from agents.configuration.composition import check_types
-from agents.diffusion import (
-    CategoricalProcess,
-    GaussianProcess,
-    MixedStep,
-    Preconditioning,
-    ResidualVariance,
-    StepTable,
-)
+from agents.diffusion import CategoricalProcess, MixedStep, Preconditioning, ResidualVariance, StepTable
 from agents.diffusion.categorical import UNMASKINGS, make_categorical_schedule
-from agents.diffusion.gaussian import check_weighting, loss_weights, make_schedule, timestep_weights
+from agents.diffusion.gaussian import loss_weights
 from agents.diffusion.reverse_steps import ReverseStep, state_of
 from agents.networks.denoisers import MixedDenoiser, Observed
 from agents.networks.flux_modules import CountConditioning
@@ -33,7 +26,7 @@ from agents.networks.registry import build_network, config_from_state
 from agents.networks.text import PADDING, Text, TextEncoder, vocabulary, warn_unknown
 from agents.networks.text_encoders import text_config_from_state, text_encoder
 from agents.priors.config import MixedPriorConfig
-from agents.priors.guidance import Hook, Start
+from agents.priors.guidance import Hook
 from agents.priors.prior import (
     UNIONS,
     DenoiserOutput,
@@ -112,12 +105,9 @@ class MixedPrior(ScenePrior):
             raise unknown_name("unmasking", config.unmasking, UNMASKINGS)
         if config.union not in UNIONS:
             raise unknown_name("union", config.union, UNIONS)
-        check_weighting(config.loss_weighting, config.prediction)
         if config.empty_slots == "dropped" and not getattr(config.network, "reads_slot_mask", False):
             raise InvalidInputError("empty_slots='dropped' needs network='flux'; others take empty_slots='attended'")
         self._keep(config, normalizer, preconditioning, card, residual)
-        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
-        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         self.categories = CategoricalProcess(
             make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
         )
@@ -127,22 +117,14 @@ class MixedPrior(ScenePrior):
         self.denoiser = MixedDenoiser(
             build_network(config.network), self.process, self.categories, encoder, config.empty_slots
         )
-        self._timestep_weights = timestep_weights(config.timesteps, schedule, config.noise_mean, config.noise_std)
 
     @classmethod
-    def from_state(
-        cls,
-        fields: dict[str, Any],
-        normalizer: Normalizer,
-        preconditioning: Preconditioning,
-        card: dict[str, Any] | None,
-        residual: ResidualVariance | None,
-    ) -> MixedPrior:
-        """From the ``prior`` entry of a configuration file."""
+    def config_from_state(cls, fields: dict[str, Any]) -> MixedPriorConfig:
+        """The configuration in the ``prior`` entry of a file."""
         text = text_config_from_state(fields.get("text"))
         fields = {**fields, "network": config_from_state(fields["network"], "mixed"), "text": text}
         check_types(MixedPriorConfig, fields)
-        return cls(MixedPriorConfig(**fields), normalizer, preconditioning, card, residual)
+        return MixedPriorConfig(**fields)
 
     def weights(self) -> dict[str, Tensor]:
         """Tensors of the network, and those of the text encoder under ``text_encoder.``."""
@@ -186,7 +168,7 @@ class MixedPrior(ScenePrior):
         indices, unknown = encoder.tokenize(prompts)
         warn_unknown(unknown)
         longest = encoder.token_space[0]
-        return torch.nn.functional.pad(indices, (0, longest - indices.shape[1]), value=PADDING)
+        return F.pad(indices, (0, longest - indices.shape[1]), value=PADDING)
 
     def encode_tokens(self, indices: Tensor) -> Text:
         """Tokens (B, L', W) and mask (B, L') of token indices (B, L); equal rows are encoded once."""
@@ -280,10 +262,9 @@ class MixedPrior(ScenePrior):
         self.config = replace(self.config, open_empty_share=share)
         return self
 
-    def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
-        """x_T (count, slots, D): normal poses, categories from their distribution at T, known entries clamped."""
-        noise = torch.randn(count, slots, self.scene_type.features, generator=generator, device=self._fixed.device)
-        probs = self.categories.prior().to(noise).expand(count, slots, -1)
+    def initial_from_noise(self, noise: Tensor) -> Tensor:
+        """x_T (B, N, D) from ``noise``: normal poses, and categories drawn from their distribution at T."""
+        probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
         return self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
 
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
@@ -404,34 +385,12 @@ class MixedPrior(ScenePrior):
         )
 
     @torch.no_grad()
-    def sample_tensor(
-        self, count: int, *, prompts: Sequence[str] | None = None, guidance: float = 0.0, num_steps: int = 50,
-        slots: int | None = None, generator: Generator | None = None, eta: float = 1.0, hook: Hook | None = None,
-    ) -> Tensor:  # fmt: skip
-        """``count`` denoised scenes x_0 (count, slots, D), as :meth:`ScenePrior.sample_tensor` describes."""
-        text = None if prompts is None else self.encode_prompts(prompts)
-        start = self.initial(count, self.config.slots if slots is None else slots, generator)
-        table = self.step_table(num_steps)
-        return self.run_chain(start, table, generator, text=text, guidance=guidance, eta=eta, hook=hook)
-
-    @torch.no_grad()
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
         observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
         eta: float = 1.0, hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D) from x_T, with observed entries kept.
-
-        Args:
-            x: x_T (B, N, D), or the scenes at step ``first``.
-            table: the chain.
-            noises: one generator for all scenes, or one per scene; None for torch's own.
-            observed: entries that carry no noise.
-            text, guidance, eta, closed: arguments of :meth:`transition`.
-            resample: number of times that each step is taken, with noise added again in between.
-            hook: hook that is called at the last time that each step is taken.
-            first: step that the chain begins at.
-        """
+        """x_0 (B, N, D), as :meth:`ScenePrior.run_chain` describes it; observed entries carry no noise."""
         free = self.unconditional(len(x)) if text is None or guidance else None
         x = x if observed is None else observed.write(x)
         for step in range(first, len(table)):
@@ -439,7 +398,10 @@ class MixedPrior(ScenePrior):
             rounds = resample if after > 0 else 1
             for again in range(rounds):
                 if again:
-                    x = self._renoise(x, after, level, draw_noise(x, noises))
+                    noise = draw_noise(x, noises)  # for a sample of q(x_t | x_s), s = after < t = level
+                    pose = self.process.renoise(x[..., :POSE_FEATURES], after, level, noise[..., :POSE_FEATURES])
+                    rows = self.categories.transition(after, level).to(x)[state_of(x[..., POSE_FEATURES:])]
+                    x = self.clamp(self.with_states(pose, rows, noise))
                     x = x if observed is None else observed.write(x)
                 reverse: ReverseStep = self.transition(
                     x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta, closed=closed
@@ -449,31 +411,6 @@ class MixedPrior(ScenePrior):
                 x = reverse.from_noise(draw_noise(x, noises))
                 x = x if observed is None else observed.write(x)
         return x
-
-    def _renoise(self, x_s: Tensor, s: int, t: int, noise: Tensor) -> Tensor:
-        """A sample of q(x_t | x_s), s < t."""
-        pose = self.process.renoise(x_s[..., :POSE_FEATURES], s, t, noise[..., :POSE_FEATURES])
-        rows = self.categories.transition(s, t).to(x_s)[state_of(x_s[..., POSE_FEATURES:])]
-        return self.clamp(self.with_states(pose, rows, noise))
-
-    # -- inpainting -------------------------------------------------------------------------------
-
-    def regenerate(
-        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
-        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
-        start: Start | None = None,
-    ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; the rest is observed."""
-        text = None if prompts is None else self.encode_prompts(prompts)
-        observed = Observed(self.encode(batch), ~mask[..., 0], ~mask[..., 1])
-        noise = draw_noise(observed.x, generators)
-        probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
-        x = self.clamp(self.with_states(noise[..., :POSE_FEATURES], probs, noise))
-        first, x = (0, x) if start is None else (start[0], start[1].to(x))
-        closed = self.closed_categories(batch, mask)
-        return self.run_chain(
-            x, table, generators, observed, text, guidance, resample, hook=hook, first=first, closed=closed
-        )
 
     # -- training ---------------------------------------------------------------------------------
 
@@ -559,25 +496,16 @@ class MixedPrior(ScenePrior):
         fixed[: len(self.scene_type.fixed)] = True
         return Observed(x0, (pose | fixed).to(x0.device), (category | fixed).to(x0.device))
 
-    @torch.no_grad()
-    def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
-        """Measure the error of the denoised pose on scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
-        generator = Generator().manual_seed(seed)
-        timesteps = StepTable.spaced(self.config.num_timesteps, levels).timesteps.flip(0)
+    def mean_square_error(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """(12,) error of the poses of free objects, as :meth:`ScenePrior.mean_square_error` describes it."""
         present = (x0[..., POSE_FEATURES:].argmax(dim=-1) != self.num_categories - 1).float()
         present[:, : len(self.scene_type.fixed)] = 0.0
-        rows = []
-        for t in timesteps:
-            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
-            level = t.to(x0.device).expand(len(x0))
-            poses = [
-                self.denoiser(part, level[: len(part)], self.observed_entries(part), self.unconditional(len(part)))[0]
-                for part in self.add_noise(x0, level, noise).split(_AT_ONCE)
-            ]
-            error = (torch.cat(poses) - x0[..., :POSE_FEATURES]).square() * present[..., None]
-            rows.append((error.sum(dim=(0, 1)) / present.sum()).cpu())
-        self.residual = ResidualVariance(timesteps, torch.stack(rows))
-        return self.residual
+        poses = [
+            self.denoiser(part, t[: len(part)], self.observed_entries(part), self.unconditional(len(part)))[0]
+            for part in self.add_noise(x0, t, noise).split(_AT_ONCE)
+        ]
+        error = (torch.cat(poses) - x0[..., :POSE_FEATURES]).square() * present[..., None]
+        return error.sum(dim=(0, 1)) / present.sum()
 
 
 def prompt_words(scene_type: SceneType) -> tuple[str, ...]:

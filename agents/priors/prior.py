@@ -15,13 +15,14 @@ from torch import Generator, Tensor, nn
 
 from agents.configuration.prior_names import joint_name, split_name
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, ReverseStep, StepTable
+from agents.diffusion.gaussian import check_weighting, make_schedule, timestep_distribution, timestep_weights
 from agents.networks.denoisers import Observed
 from agents.networks.flux_modules import CountConditioning
 from agents.networks.registry import config_state
 from agents.networks.text import Text
 from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.files import StoredPrior, explained, read_stored, write_stored
-from agents.priors.guidance import Guide, Hook, Start, Watch, guidance_hook, physics_strength
+from agents.priors.guidance import Guide, Hook, Watch, guidance_hook, physics_strength
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.envs.settings import check_claim_guidance, check_physics_guidance
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -139,7 +140,8 @@ class ScenePrior(nn.Module, ABC):
         card: dict[str, Any] | None,
         residual: ResidualVariance | None,
     ) -> None:
-        """Store the parts that priors of every process have."""
+        """Store the parts that priors of every process have, and make the process of their continuous features."""
+        check_weighting(config.loss_weighting, config.prediction)
         self.config = config
         self.scene_type = get_scene_type(config.scene_type)
         check_physics_guidance(config.physics_guidance, self.scene_type)
@@ -149,6 +151,10 @@ class ScenePrior(nn.Module, ABC):
         self.residual = residual
         fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
         self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
+        schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
+        self.process = GaussianProcess(schedule, config.prediction, preconditioning)
+        distribution = timestep_distribution(config.timesteps, config.prediction)
+        self._timestep_weights = timestep_weights(distribution, schedule, config.noise_mean, config.noise_std)
 
     @property
     def device(self) -> torch.device:
@@ -181,13 +187,15 @@ class ScenePrior(nn.Module, ABC):
         name, named = split_name(name)
         terms = [term for spec in (named, adapter) if spec for term in parse_adapters(spec)]
         stored = read_stored(name)
-        with explained(name):
-            prior = prior_class(stored.process).from_state(
-                stored.fields, stored.normalizer, stored.preconditioning, stored.card, stored.residual
-            )
-            prior.load_weights(stored.tensors)
         if terms:
-            merge_adapters(prior, str(name), terms)
+            stored = merge_adapters(stored, str(name), terms)
+        with explained(name):
+            if stored.process not in _CLASSES:
+                raise unknown_name("process", stored.process, _CLASSES)
+            made: Any = _CLASSES[stored.process]
+            config = made.config_from_state(stored.fields)
+            prior = made(config, stored.normalizer, stored.preconditioning, stored.card, stored.residual)
+            prior.load_weights(stored.tensors)
         prior.loaded_as = joint_name(name, [spec for spec in (named, adapter) if spec])
         return cast(Prior, prior.eval())
 
@@ -216,15 +224,8 @@ class ScenePrior(nn.Module, ABC):
 
     @classmethod
     @abstractmethod
-    def from_state(
-        cls: type[Prior],
-        fields: dict[str, Any],
-        normalizer: Normalizer,
-        preconditioning: Preconditioning,
-        card: dict[str, Any] | None,
-        residual: ResidualVariance | None,
-    ) -> Prior:
-        """From the ``prior`` entry of a configuration file."""
+    def config_from_state(cls, fields: dict[str, Any]) -> Any:
+        """Inverse of :meth:`config_state`, also after a trip through JSON."""
 
     def weights(self) -> dict[str, Tensor]:
         """Trained tensors by name, as a prior's file holds them."""
@@ -354,8 +355,12 @@ class ScenePrior(nn.Module, ABC):
         return StepTable.spaced(self.config.num_timesteps, num_steps)
 
     def initial(self, count: int, slots: int, generator: Generator | None = None) -> Tensor:
-        """x_T (count, slots, D): standard normal with the known entries clamped."""
+        """x_T (count, slots, D), see :meth:`initial_from_noise`; the generator is on the device of the weights."""
         noise = torch.randn(count, slots, self.features, generator=generator, device=self._fixed.device)
+        return self.initial_from_noise(noise)
+
+    def initial_from_noise(self, noise: Tensor) -> Tensor:
+        """x_T (B, N, D) from standard normal ``noise`` (B, N, D), known entries clamped."""
         return self.clamp(noise)
 
     @abstractmethod
@@ -371,8 +376,9 @@ class ScenePrior(nn.Module, ABC):
         weight, std = self.process.estimate(int(table.timesteps[step]), int(table.previous[step]), self.residual)
         return weight, std[TRANSLATION].to(self.device)
 
+    @torch.no_grad()
     def sample(
-        self, count: int, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        self, count: int, *, prompt: Prompt = None, guidance: float = 0.0,
         claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50,
         slots: int | None = None, seed: int = 0, batch_size: int = 64, eta: float = 1.0,
     ) -> SceneBatch:  # fmt: skip
@@ -402,44 +408,41 @@ class ScenePrior(nn.Module, ABC):
         if batch_size < 1:
             raise InvalidInputError(f"batch_size={batch_size}: at least one scene must be denoised at a time")
         wide = self.config.slots if slots is None else slots
-        prompts = check_prompts(
-            prompt, guidance, count, scene_type=self.scene_type, slots=wide, conditional=self.conditional,
-            claim_guidance=claim_guidance,
-        )  # fmt: skip
+        prompts = self._check_prompts(prompt, guidance, claim_guidance, count, wide)
         strength = physics_strength(physics_guidance, self.config, self.scene_type)
-        generator = Generator(str(self._fixed.device)).manual_seed(seed)
+        generator, table = Generator(str(self.device)).manual_seed(seed), self.step_table(num_steps)
         chunks = []
         for start in range(0, count, batch_size):
             texts = None if prompts is None else prompts[start : start + batch_size]
             size = min(batch_size, count - start)
-            x0 = self.sample_tensor(
-                size, prompts=texts, guidance=guidance, num_steps=num_steps, slots=slots, generator=generator, eta=eta,
-                hook=self.sampling_hook(
-                    size, wide, num_steps, prompts=texts, claim_guidance=claim_guidance,
-                    physics_guidance=strength,
-                ),
-            )  # fmt: skip
-            chunks.append(x0)
+            hook = self.sampling_hook(
+                size, wide, num_steps, prompts=texts, claim_guidance=claim_guidance, physics_guidance=strength
+            )
+            text = None if texts is None else self.encode_prompts(texts)
+            x = self.initial(size, wide, generator)
+            chunks.append(self.run_chain(x, table, generator, text=text, guidance=guidance, eta=eta, hook=hook))
         return self.decode(torch.cat(chunks))
 
-    @torch.no_grad()
-    def sample_tensor(
-        self, count: int, *, prompts: Sequence[str] | None = None, guidance: float = 0.0, num_steps: int = 50,
-        slots: int | None = None, generator: Generator | None = None, eta: float = 1.0, hook: Hook | None = None,
+    @abstractmethod
+    def run_chain(
+        self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
+        observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
+        eta: float = 1.0, hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
-        """``count`` denoised scenes x_0 (count, slots, D), normalised, from one batch; arguments as in :meth:`sample`.
+        """x_0 (B, N, D) from x_T, with observed entries kept. No gradient passes.
 
-        ``hook`` is called at every step, before x_{t-1} is drawn.
-
-        Priors that read prompts override it.
+        Args:
+            x: x_T (B, N, D), or the scenes at step ``first``.
+            table: the chain.
+            noises: one generator for all scenes, or one per scene; None for torch's own.
+            observed: entries that are kept.
+            text: tokens (B, L, W) and mask (B, L) of the prompts; None without.
+            guidance, eta: settings of :meth:`sample`.
+            resample: number of times that each step is taken, with noise added again in between.
+            hook: hook that is called at the last time that each step is taken.
+            first: step that the chain begins at.
+            closed: (B, K) bool, categories that slots that are not observed do not take.
         """
-        table = self.step_table(num_steps)
-        x = self.initial(count, self.config.slots if slots is None else slots, generator)
-        for step in range(len(table)):
-            noise = torch.randn(x.shape, generator=generator, device=x.device)
-            reverse: ReverseStep = self.transition(x, step, table, eta=eta)
-            x = (reverse if hook is None else hook(step, x, reverse)).from_noise(noise)
-        return x
 
     def sampling_hook(
         self, count: int, slots: int, num_steps: int, *, prompts: Sequence[str] | None = None,
@@ -457,16 +460,14 @@ class ScenePrior(nn.Module, ABC):
         """
         moved = torch.ones(count, slots, 1, dtype=torch.bool)
         moved[:, : len(self.scene_type.fixed)] = False
-        return guidance_hook(
-            self, self.scene_type, self.step_table(num_steps), self.decode, moved,
-            prompts=prompts, claim_guidance=claim_guidance, physics_guidance=physics_guidance,
-        )  # fmt: skip
+        table = self.step_table(num_steps)
+        return guidance_hook(self, table, self.decode, moved, prompts, claim_guidance, physics_guidance)
 
     # -- inpainting -------------------------------------------------------------------------------
 
     @torch.no_grad()
     def inpaint(
-        self, batch: SceneBatch, mask: Tensor, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        self, batch: SceneBatch, mask: Tensor, *, prompt: Prompt = None, guidance: float = 0.0,
         claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50,
         generators: Sequence[Generator] | None = None, seed: int = 0, resample: int = 1, watch: Watch | None = None,
         guide: Guide | None = None,
@@ -508,33 +509,54 @@ class ScenePrior(nn.Module, ABC):
         """
         both = check_mask(batch, mask, generators, resample).to(batch.tensor.device)
         both[:, : len(self.scene_type.fixed)] = False
-        slots = batch.tensor.shape[1]
-        prompts = check_prompts(
-            prompt, guidance, len(batch), scene_type=self.scene_type, slots=slots, conditional=self.conditional,
-            claim_guidance=claim_guidance,
-        )  # fmt: skip
+        prompts = self._check_prompts(prompt, guidance, claim_guidance, len(batch), batch.tensor.shape[1])
         strength = physics_strength(physics_guidance, self.config, self.scene_type)
         if generators is None:
             generators = [Generator().manual_seed(seed + i) for i in range(len(batch))]
-        device, table = self.device, self.step_table(num_steps)
-        moved = both[..., :1]
+        table = self.step_table(num_steps)
 
         def scenes(x: Tensor) -> SceneBatch:
             return merge(batch, self.decode(x).to(batch.tensor.device), both)
 
-        hook = guidance_hook(
-            self, self.scene_type, table, scenes, moved, prompts=prompts, claim_guidance=claim_guidance,
-            physics_guidance=strength, guide=guide, watch=watch,
-        )  # fmt: skip
+        hook = guidance_hook(self, table, scenes, both[..., :1], prompts, claim_guidance, strength, guide, watch)
+        text = None if prompts is None else self.encode_prompts(prompts)
+        given, changed = batch.to(self.device), both.to(self.device)
+        observed = Observed(self.encode(given), ~changed[..., 0], ~changed[..., 1])
+        first, x = 0, self.initial_from_noise(draw_noise(observed.x, generators))
         begins = getattr(watch, "start", None)
         start = None if begins is None else begins(len(table))
-        x = self.regenerate(
-            batch.to(device), both.to(device), table, generators, resample, prompts, guidance, hook, start
+        if start is not None:
+            first, x = start[0], start[1].to(x)
+        closed = self.closed_categories(given, changed)
+        x = self.run_chain(
+            x, table, generators, observed, text, guidance, resample, hook=hook, first=first, closed=closed
         )
-        return merge(batch, self.decode(x).to(batch.tensor.device), both)
+        return scenes(x)
+
+    def _check_prompts(
+        self, prompt: Prompt, guidance: float, claim_guidance: float, count: int, slots: int
+    ) -> list[str] | None:
+        """One prompt per scene, or None for scenes without; raises InvalidInputError as :meth:`inpaint` does."""
+        if not math.isfinite(guidance):
+            raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
+        check_claim_guidance(prompt, claim_guidance)
+        if prompt is None:
+            check_guidance(prompt, guidance)
+            return None
+        texts = [prompt] if isinstance(prompt, str) else prompt
+        if not isinstance(texts, Sequence) or not all(isinstance(text, str) for text in texts):
+            raise InvalidInputError(f"prompt={str(prompt)[:80]!r} must be a text, a list of texts, or null")
+        prompts = [prompt] * count if isinstance(prompt, str) else list(prompt)
+        if len(prompts) != count:
+            raise InvalidInputError(f"{len(prompts)} prompts for {count} scenes; give one text, or one per scene")
+        if not self.conditional:
+            raise no_text(self.scene_type, next(iter(prompts), ""))
+        check_guidance("".join(prompts), guidance)
+        check_object_count(prompts, self.scene_type, slots)
+        return prompts
 
     def complete(
-        self, batch: SceneBatch, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        self, batch: SceneBatch, *, prompt: Prompt = None, guidance: float = 0.0,
         claim_guidance: float = 0.0, physics_guidance: float | None = None, slots: int | None = None,
         fill: int | None = None, num_steps: int = 50, seed: int = 0,
     ) -> SceneBatch:  # fmt: skip
@@ -556,12 +578,18 @@ class ScenePrior(nn.Module, ABC):
             raise InvalidInputError(f"fill={fill}: give the most objects to add, at least 0, or None")
         open_slots = wide.is_empty if fill is None else wide.is_empty & (wide.is_empty.cumsum(dim=1) <= fill)
         return self.inpaint(
-            wide, open_slots, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance,
-            physics_guidance=physics_guidance, num_steps=num_steps, seed=seed,
-        )  # fmt: skip
+            wide,
+            open_slots,
+            prompt=prompt,
+            guidance=guidance,
+            claim_guidance=claim_guidance,
+            physics_guidance=physics_guidance,
+            num_steps=num_steps,
+            seed=seed,
+        )
 
     def rearrange(
-        self, batch: SceneBatch, *, prompt: str | Sequence[str] | None = None, guidance: float = 0.0,
+        self, batch: SceneBatch, *, prompt: Prompt = None, guidance: float = 0.0,
         claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50, seed: int = 0,
     ) -> SceneBatch:  # fmt: skip
         """New poses for the free objects of ``batch``; all categories, and the poses of welded objects, stay.
@@ -571,17 +599,15 @@ class ScenePrior(nn.Module, ABC):
         free = batch.is_free
         mask = torch.stack([free, torch.zeros_like(free)], dim=-1)
         return self.inpaint(
-            batch, mask, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance,
-            physics_guidance=physics_guidance, num_steps=num_steps, seed=seed,
-        )  # fmt: skip
-
-    @abstractmethod
-    def regenerate(
-        self, batch: SceneBatch, mask: Tensor, table: StepTable, generators: Sequence[Generator], resample: int,
-        prompts: Sequence[str] | None = None, guidance: float = 0.0, hook: Hook | None = None,
-        start: Start | None = None,
-    ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D) in which poses and categories under ``mask`` (B, N, 2) are new; used by :meth:`inpaint`."""
+            batch,
+            mask,
+            prompt=prompt,
+            guidance=guidance,
+            claim_guidance=claim_guidance,
+            physics_guidance=physics_guidance,
+            num_steps=num_steps,
+            seed=seed,
+        )
 
     def closed_categories(self, batch: SceneBatch, mask: Tensor) -> Tensor:
         """(B, K) bool: categories that the slots under ``mask`` (B, N, 2) must not take.
@@ -590,21 +616,11 @@ class ScenePrior(nn.Module, ABC):
         masks furniture, so without this rule every further inpainting of empty slots would add furniture.
         """
         changed = mask[..., 1]
-        masked = self.closed_by_furniture(batch.categories, changed).any(dim=1)
-        return self.closed_by_furniture(batch.categories, ~changed) & ~masked[:, None]
-
-    def closed_by_furniture(self, categories: Tensor, slots: Tensor) -> Tensor:
-        """(B, K) bool: the welded assets, in scenes with generated furniture in ``slots``.
-
-        Args:
-            categories: (B, N) int64 index of each slot's asset.
-            slots: (B, N) bool.
-        """
-        welded = torch.zeros(self.scene_type.num_assets + 1, dtype=torch.bool, device=categories.device)
+        welded = torch.zeros(self.scene_type.num_assets + 1, dtype=torch.bool, device=changed.device)
         welded[list(self.scene_type.welded_categories)] = True
-        indices = torch.tensor(self.scene_type.welded_categories, device=categories.device, dtype=torch.long)
-        furniture = torch.isin(categories, indices) & slots
-        return furniture[:, len(self.scene_type.fixed) :].any(dim=1, keepdim=True) & welded
+        furniture, changed = (x[:, len(self.scene_type.fixed) :] for x in (welded[batch.categories], changed))
+        closed = (furniture & ~changed).any(dim=1) & ~(furniture & changed).any(dim=1)
+        return closed[:, None] & welded
 
     # -- training ---------------------------------------------------------------------------------
 
@@ -670,16 +686,21 @@ class ScenePrior(nn.Module, ABC):
         weight[:, TRANSLATION] *= self.config.translation_weight
         return weight
 
-    @abstractmethod
+    @torch.no_grad()
     def fit_residual(self, x0: Tensor, levels: int = 40, seed: int = 0) -> ResidualVariance:
         """Measure the denoiser's error on normalised scenes ``x0`` (B, N, D) at ``levels`` timesteps, and keep it."""
+        generator = Generator().manual_seed(seed)
+        timesteps = StepTable.spaced(self.config.num_timesteps, levels).timesteps.flip(0)
+        rows = []
+        for t in timesteps:
+            noise = torch.randn(x0.shape, generator=generator).to(x0.device)
+            rows.append(self.mean_square_error(x0, t.to(x0.device).expand(len(x0)), noise).cpu())
+        self.residual = ResidualVariance(timesteps, torch.stack(rows))
+        return self.residual
 
-
-def prior_class(process: str) -> type[Any]:
-    """The class of priors of a process: ``"continuous"``, ``"mixed"``, or the ``process_name`` of another subclass."""
-    if process not in _CLASSES:
-        raise unknown_name("process", process, _CLASSES)
-    return _CLASSES[process]
+    @abstractmethod
+    def mean_square_error(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """(F,) mean squared error of denoised scenes ``x0`` (B, N, D), with ``noise`` added at timesteps ``t`` (B,)."""
 
 
 def draw_noise(like: Tensor, generators: Sequence[Generator] | Generator | None) -> Tensor:
@@ -722,44 +743,6 @@ def merge(batch: SceneBatch, new: SceneBatch, mask: Tensor) -> SceneBatch:
 # -- prompts ---------------------------------------------------------------------------------------
 
 
-def check_prompts(
-    prompt: Prompt, guidance: float, count: int, *, scene_type: SceneType, slots: int, conditional: bool,
-    claim_guidance: float = 0.0,
-) -> list[str] | None:  # fmt: skip
-    """One prompt per scene, or None for scenes without.
-
-    Args:
-        prompt: one text for all scenes, one per scene, or None.
-        guidance: w of classifier-free guidance.
-        count: scenes.
-        scene_type: scene type of the scenes.
-        slots: slots per scene.
-        conditional: whether the prior reads prompts.
-        claim_guidance: strength of claim guidance.
-
-    Raises:
-        InvalidInputError: a prior that reads no prompts, not one prompt per scene, guidance without a prompt, claim
-            guidance below 0, or more objects asked for than there are slots.
-    """
-    if not math.isfinite(guidance):
-        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
-    check_claim_guidance(prompt, claim_guidance)
-    if prompt is None:
-        check_guidance(prompt, guidance)
-        return None
-    texts = [prompt] if isinstance(prompt, str) else prompt
-    if not isinstance(texts, Sequence) or not all(isinstance(text, str) for text in texts):
-        raise InvalidInputError(f"prompt={str(prompt)[:80]!r} must be a text, a list of texts, or null")
-    prompts = [prompt] * count if isinstance(prompt, str) else list(prompt)
-    if len(prompts) != count:
-        raise InvalidInputError(f"{len(prompts)} prompts for {count} scenes; give one text, or one per scene")
-    if not conditional:
-        raise no_text(scene_type, next(iter(prompts), ""))
-    check_guidance("".join(prompts), guidance)
-    check_object_count(prompts, scene_type, slots)
-    return prompts
-
-
 def check_guidance(prompt: object, guidance: float) -> None:
     """Refuse guidance without a prompt; ``""`` is no prompt."""
     if guidance and not prompt:
@@ -792,11 +775,7 @@ def asked_objects(prompt: str, scene_type: SceneType) -> int:
 
 
 def check_object_count(prompts: Sequence[str], scene_type: SceneType, slots: int) -> None:
-    """Refuse prompts that ask for more objects than a scene has slots; free text is not checked.
-
-    Raises:
-        InvalidInputError: names the prompt, the number and the remedy.
-    """
+    """Raise InvalidInputError for a prompt that asks for more objects than a scene has slots; free text may."""
     for prompt in dict.fromkeys(prompts):
         asked = asked_objects(prompt, scene_type)
         if asked > slots:

@@ -75,7 +75,7 @@ def test_a_low_axis_is_blurred_by_its_own_noise() -> None:
         height = Relations(1, 2, (5.0, 5.0, 0.5), blur=blur)(position, noise)[1][0, 0, 1, 8]
         assert float(height) == pytest.approx(math.exp(-0.5 * 0.02**2 / (2 * metres**2 + 0.01**2)), rel=1e-5)
     with pytest.raises(UnknownNameError, match="axis"):
-        Relations(1, 2, (1.0, 1.0, 1.0), blur="axes")
+        RelationsConfig(blur="axes")
 
 
 def test_messages_are_weighted_means_of_the_features() -> None:

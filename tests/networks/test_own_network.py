@@ -10,7 +10,15 @@ import pytest
 import torch
 
 from agents import PretrainConfig, ScenePrior, pretrain
-from agents.networks import MixedFluxConfig, list_networks, match_parameters, parameter_count, registry
+from agents.networks import (
+    MixedFlux,
+    MixedFluxConfig,
+    MixedMiDiffusionConfig,
+    list_networks,
+    match_parameters,
+    parameter_count,
+    registry,
+)
 from agents.networks.registry import register_network
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from tests.helpers.outside_package import installed
@@ -61,5 +69,5 @@ def test_slots_that_it_cannot_ignore_are_refused(tmp_path: Path) -> None:
 
 def test_a_name_that_is_taken_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="there is a mixed network 'flux' already"):
-        register_network("flux", "mixed", registry.MixedMiDiffusionConfig, lambda config: None)  # type: ignore[arg-type, return-value]
-    register_network("flux", "mixed", MixedFluxConfig, registry.MixedFlux)  # once more, as a module imported twice
+        register_network("flux", "mixed", MixedMiDiffusionConfig, lambda config: None)  # type: ignore[arg-type, return-value]
+    register_network("flux", "mixed", MixedFluxConfig, MixedFlux)  # once more, as a module imported twice

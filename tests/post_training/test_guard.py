@@ -165,7 +165,7 @@ def test_a_reward_that_learns_is_judged_by_the_classifier(monkeypatch: pytest.Mo
     ]
     kept = {}
     for learns in (True, False):
-        guard = Guard(tiny_prior().sample_tensor(2, num_steps=2), limit=1.1, seed=0, learns=learns)
+        guard = Guard(tiny_prior().initial(2, 34), limit=1.1, seed=0, learns=learns)
         each = iter(figures)
         monkeypatch.setattr(guard, "_measure", lambda prior, sample, each=each: (1.0, next(each)))
         guard.start(tiny_prior())
