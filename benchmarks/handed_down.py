@@ -2,9 +2,9 @@
 
     python benchmarks/handed_down.py [--list]
 
-Runs two iterations under ``sys.setprofile`` and records the calls that receive the configuration or one of its groups as
-an argument, each pair of caller and callee once and in order. A return is a call into a file that received them before,
-after a call into another file. ``--list`` prints the functions.
+Runs two iterations under ``sys.setprofile`` and records the calls that receive the configuration or one of its groups
+as an argument, each pair of caller and callee once and in order. A return is a call into a file that received them
+before, after a call into another file. ``--list`` prints the functions.
 """
 
 from __future__ import annotations
