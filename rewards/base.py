@@ -110,10 +110,8 @@ def facts_of(reward: object) -> dict[str, bool]:
 
 
 def declared_maximum(reward: object, slots: int, free_slots: int) -> float | None:
-    """The largest value that a reward declares for scenes of this size; None if it declares no positive number.
-
-    The attribute ``maximum`` of the reward is a number, or a method of the number of slots per scene, and of those
-    without fixed objects.
+    """The largest value that a reward declares for scenes of this size; None if it declares no positive number. Its
+    attribute ``maximum`` is a number, or a method of the number of slots per scene, and of those without fixed objects.
 
     >>> class Share:
     ...     maximum = 1.0

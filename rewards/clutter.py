@@ -121,9 +121,8 @@ class _Lines:
 
 
 def _chords(corners: Array, y: Array) -> tuple[Array, Array]:
-    """(M,) start and (M,) end of lines at ``y`` (M,) within the convex outline of ``corners`` (3, V) from above.
-
-    A line that misses the outline starts at infinity and ends at minus infinity.
+    """(M,) start and end of lines at ``y`` (M,) within the convex outline of ``corners`` (3, V) from above. A line that
+    misses the outline starts at infinity and ends at minus infinity.
     """
     from scipy.spatial import ConvexHull
 

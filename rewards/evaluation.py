@@ -38,12 +38,9 @@ _MAX_TEXT = 300
 def seeded_generators(seed: int, batch: SceneBatch | None = None) -> Iterator[None]:
     """Context in which the generators of torch (CPU), NumPy and Python have a seed that depends on the scenes.
 
-    The seed depends only on ``seed``, the scenes and :func:`current_draw`, so the same scenes get the same numbers in
-    every call, in every process, and after a run is resumed. Afterwards the generators have their earlier states.
-
-    Args:
-        seed: seed of the run.
-        batch: scenes that are scored; None while the reward is made.
+    The seed depends only on ``seed``, the scenes (None while the reward is made) and :func:`current_draw`, so the same
+    scenes get the same numbers in every call and process, and after a run is resumed. Earlier states come back
+    afterwards.
     """
     states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     scenes = b"" if batch is None else batch.tensor.detach().cpu().contiguous().numpy().tobytes()
@@ -107,10 +104,8 @@ def evaluate_reward(
 
 
 def reward_scorer(reward: Any) -> SceneScorer:
-    """``reward`` as a function that environments call; the entry point ``scene_envs.resolvers`` names this function.
-
-    Args:
-        reward: a name, mapping, function, class or reward; see :func:`rewards.resolve_reward`.
+    """``reward``, as for :func:`rewards.resolve_reward`, as a function that environments call; named by the entry point
+    ``scene_envs.resolvers``.
 
     >>> reward_scorer("object_count")(SceneBatch.empty("dimsum_table", 2)).value
     tensor([1., 1.])

@@ -32,11 +32,9 @@ _assets: dict[tuple[int, ...], tuple[Asset, ...]] = {}
 
 
 def verdicts(batch: SceneBatch, limits: dict[str, float], pool: PhysicsPool | None) -> FeasibilityResult:
-    """:func:`scene_envs.physics.feasibility` of scenes, computed only for scenes that were not judged recently.
-
-    Scenes are recognised by their content: type, poses, categories and order of slots. A verdict depends only on its
-    scene, bit for bit, so it may be kept. Verdicts of invalid scenes are not kept: a worker may only have been slow.
-    ``limits`` are keyword arguments of ``feasibility``.
+    """:func:`scene_envs.physics.feasibility`, with the keywords ``limits``, only of scenes that were not judged
+    recently. Scenes are recognised by type, poses, categories and order of slots, on which alone a verdict depends, bit
+    for bit. Verdicts of invalid scenes are not kept: a worker may only have been slow.
     """
     from scene_envs.physics import FeasibilityResult, feasibility
 

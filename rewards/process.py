@@ -244,9 +244,8 @@ class SeededReward:
 
 
 def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: float = 1.0, workers: int = 0) -> Any:
-    """A reward as runs use it: one of this package in this process, any other in a process that can be ended.
-
-    Functions and objects, which exist in this process alone, stay in it. Arguments as for :class:`IsolatedReward`.
+    """A reward as runs use it: one of this package in this process, any other in a process that can be ended, except
+    functions and objects, which exist in this process alone. Arguments as for :class:`IsolatedReward`.
 
     >>> run_reward("object_count")
     ObjectCount()
@@ -262,10 +261,9 @@ def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: flo
 def describe_rewards(
     names: Sequence[str], timeout: float = 60.0, memory: float = 1.0
 ) -> Iterator[tuple[str, RewardInfo | None, str]]:
-    """Each name with its listing, or with the reason why the reward cannot be used.
-
-    Rewards of installed packages are imported in another process. If one of them exits, crashes or hangs at its import,
-    the others are still listed. An import may take ``timeout`` seconds and ``memory`` GiB.
+    """Each name with its listing, or with the reason why the reward cannot be used. Rewards of installed packages are
+    imported in another process, within ``timeout`` seconds and ``memory`` GiB, so that one that exits, crashes or hangs
+    at its import does not hide the others.
     """
     worker: Process | None = None
     try:

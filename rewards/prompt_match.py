@@ -77,11 +77,8 @@ def claims_asked(
     name: str, prompt: str | None, batch: SceneBatch, prompts: Sequence[str] | None
 ) -> list[PromptFacts | None]:
     """Claims that a reward called ``name`` compares each scene with; None where a prompt is empty or cannot be read.
-
-    ``prompt``, one text for all scenes, is used instead of ``prompts``.
-
-    Raises:
-        InvalidInputError: there is no prompt, there is not one per scene, or ``prompt`` cannot be read.
+    ``prompt``, one text for all scenes, replaces ``prompts``. Raises InvalidInputError where there is no prompt, or not
+    one per scene, or ``prompt`` cannot be read.
     """
     from scene_envs.datasets.prompts import parse_prompt
 

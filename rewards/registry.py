@@ -35,13 +35,8 @@ _allowed_targets: list[str] = ["rewards"]
 
 
 class FunctionReward:
-    """A bare function as a reward.
-
-    Args:
-        function: function of ``(batch)`` or ``(batch, context)`` and keyword settings, which returns (B,) numbers or a
-            :class:`RewardOutput`.
-        name: name of the reward in logs; the function's own by default.
-        **settings: keyword arguments of every call.
+    """A function of ``(batch)`` or ``(batch, context)`` and keyword ``settings``, which returns (B,) numbers or a
+    :class:`RewardOutput`, as a reward; ``name`` in logs is the function's own by default.
 
     >>> FunctionReward(lambda batch: batch.counts, name="count")(SceneBatch.empty("dimsum_table", 2), RewardContext())
     RewardOutput(value=tensor([1., 1.]), per_object=None, terms={}, valid=None, object_flags={}, problem='')
@@ -127,11 +122,8 @@ def allowed_files() -> list[Path]:
 
 
 def load_local(reward: str) -> Callable[..., Any]:
-    """The function or class that ``PATH.py:NAME`` names; runs the file once per process.
-
-    Raises:
-        InvalidInputError: the file was not allowed, does not exist, or has no callable of that name.
-        RewardError: the file cannot be run.
+    """The function or class that ``PATH.py:NAME`` names; runs the file once per process. Raises InvalidInputError where
+    the file was not allowed, does not exist or has no such callable, and RewardError where it cannot be run.
     """
     match = _LOCAL.fullmatch(reward)
     assert match is not None

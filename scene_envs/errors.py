@@ -50,14 +50,8 @@ class StorageError(SceneEnvsError, OSError):
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """Build the error for an unknown ``kind`` called ``name``, offering the nearest known name.
-
-    When ``name`` is the last part of a known dotted name, that dotted name is offered.
-
-    Args:
-        kind: Kind of the name, in a user's words ("scene type", "reward", "prior").
-        name: Unknown name.
-        known: All known names.
+    """The error for an unknown ``kind`` ("scene type", "reward", "prior") called ``name``. It offers the nearest of the
+    ``known`` names, or the known dotted name whose last part ``name`` is.
 
     >>> str(unknown_name("reward", "object_cuont", ["object_count", "feasible_objects"]))
     "unknown reward 'object_cuont'; did you mean 'object_count'? Known: feasible_objects, object_count."

@@ -38,12 +38,9 @@ _SEAL = "# scene-envs, sha256 of the lines below: "
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Context with a temporary file to write, which is renamed to ``path`` when the block ends without an error.
 
-    The folder is made if it is missing. The temporary file lies in the same folder under the hidden name
-    ``.<name>.<process>.<random>.partial``. When the block fails, the temporary file is removed, and a file that was at
-    ``path`` before stays unchanged.
-
-    Raises:
-        StorageError: the operating system refused to write or to rename; the message names the file and the remedy.
+    The folder is made if it is missing; in it, the file has the hidden name ``.<name>.<process>.<random>.partial``.
+    When the block fails, it is removed, and a file at ``path`` stays unchanged. Raises StorageError, with file and
+    remedy, where the operating system refuses to write or to rename.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -77,13 +74,8 @@ def sealed(text: str) -> str:
 
 
 def read_sealed(path: str | os.PathLike[str]) -> str:
-    """The text that was given to :func:`sealed` before it was written to the file at ``path``.
-
-    The text of a file without a digest, such as one that a user wrote, is returned as it is.
-
-    Raises:
-        CorruptFileError: the file was changed after it was written, or is not UTF-8 text.
-        OSError: the file cannot be read.
+    """The text that was given to :func:`sealed` before it was written to ``path``; without a digest, as in a user's own
+    file, all of it. Raises OSError, and CorruptFileError for a file that was changed or is not UTF-8.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -141,12 +133,8 @@ def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def without_digest(content: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
-    """``content`` without the digest of :func:`with_digest`, after a check against that digest.
-
-    Content without a digest is returned unchanged, because such a file may be written by hand.
-
-    Raises:
-        CorruptFileError: the content was changed; the message says how to accept an edit.
+    """``content`` without the digest of :func:`with_digest`; CorruptFileError, which says how to accept an edit, where
+    it does not fit. Content without a digest may be written by hand and is returned unchanged.
     """
     plain = {key: value for key, value in content.items() if key != DIGEST}
     if DIGEST in content and content[DIGEST] != _digest_of(plain):
@@ -189,16 +177,9 @@ _guard = threading.Lock()
 def claimed(folder: str | os.PathLike[str], owner: str) -> Iterator[Path]:
     """Context in which this process alone writes into ``folder``, which is made if it is missing.
 
-    The claim ends with the process, even if it is killed, and may be repeated by the same process. Half-written files
-    of killed processes in the folder are removed.
-
-    Args:
-        folder: Folder to write into.
-        owner: Name of the writer, for the error message of other processes.
-
-    Raises:
-        InvalidInputError: another process writes into the folder (it is named), or ``folder`` is a file.
-        StorageError: the folder cannot be made or written to.
+    The claim ends with the process, even if it is killed, and the same process may repeat it. Half-written files of
+    killed processes are removed. Raises InvalidInputError where another process, named by its ``owner``, writes into
+    the folder or it is a file, and StorageError where it cannot be made or written to.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as parent, claimed(Path(parent) / "run", "a test") as folder:
@@ -284,9 +265,8 @@ def _takeover(writer: str, path: Path) -> str:
 
 
 def _owner_elsewhere(descriptor: int) -> str | None:
-    """The owner of the lock if it is on another computer and gave a recent sign of life; else None.
-
-    A file system may share files between computers without their locks.
+    """The owner of the lock if it is on another computer and gave a recent sign of life; else None. A file system may
+    share files between computers without their locks.
     """
     writer = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
     found = re.search(r"process \d+ on (.+), since", writer)
@@ -330,10 +310,8 @@ _PRIORS = ("prior/config.json", "config.json")
 
 
 def find_scenes(path: Path) -> Path:
-    """The file or folder of scenes that ``scenes=`` names; for a run's folder, the scene file in it.
-
-    Raises:
-        InvalidInputError: ``path`` does not exist, or the folder holds a prior and no scenes.
+    """The file or folder of scenes that ``scenes=`` names; for a run's folder, the scene file in it. Raises
+    InvalidInputError where ``path`` does not exist, or the folder holds a prior and no scenes.
     """
     if not exists(path):
         raise InvalidInputError(
@@ -350,10 +328,7 @@ def find_scenes(path: Path) -> Path:
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether a path from :func:`find_scenes` is a dataset or one of its files.
-
-    It is False for a scene file and for a folder of scene files.
-    """
+    """Whether a path from :func:`find_scenes` is a dataset or one of its files, not a file or folder of scenes."""
     return not scene_files(path) if path.is_dir() else path.suffix in (".parquet", ".arrow")
 
 
@@ -372,10 +347,7 @@ def page_part(package: str, name: str) -> str:
 
 @cache
 def page_template(package: str, name: str, *, trim_blocks: bool = False) -> Template:
-    """The template in a file in the folder of ``package``.
-
-    The template escapes all text. Its filter ``png`` gives the bytes of the file at a path in base 64.
-    """
+    """The template in a file of ``package``. It escapes all text; its filter ``png`` gives a file in base 64."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(
@@ -388,16 +360,7 @@ def page_template(package: str, name: str, *, trim_blocks: bool = False) -> Temp
 def write_tensors(
     path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
 ) -> Path:
-    """Write tensors to one file, whole or not at all.
-
-    Args:
-        path: Path of the file.
-        tensors: Tensors by name, on any device.
-        metadata: Texts by name, kept in the same file.
-
-    Raises:
-        StorageError: the file cannot be written; nothing is left of it.
-    """
+    """Write named tensors (of any device) and texts to one file, whole or not at all; StorageError where that fails."""
     from safetensors.torch import save
 
     path = Path(path)
@@ -412,11 +375,8 @@ def write_tensors(
 
 
 def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of a file, on the CPU; a file of another program, without a digest, is read as it is.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        CorruptFileError: the file is truncated, no safetensors file, or was changed.
+    """Tensors and metadata of a file, on the CPU; another program's file, without a digest, is read as it is. Raises
+    FileNotFoundError, and CorruptFileError for a file that is truncated, changed or no safetensors file.
     """
     from safetensors import SafetensorError, safe_open
 

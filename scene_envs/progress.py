@@ -16,15 +16,10 @@ STYLES = ("bar", "lines", "none")
 
 
 class Progress:
-    """Context manager that shows the progress of work.
+    """Context manager that shows the progress of work of ``total`` items, of which ``done`` were done before.
 
-    Args:
-        title: Title of the work.
-        total: Total number of items.
-        done: Number of items that were done before.
-        style: ``"bar"`` (lines where stderr is no terminal), ``"lines"`` or ``"none"``.
-        every: Seconds between lines.
-        always: Numbers of items at which a line is printed regardless of the time since the last one.
+    ``style`` is ``"bar"`` (lines where stderr is no terminal), ``"lines"`` (one per ``every`` seconds, and ``always``
+    at these numbers of items) or ``"none"``.
 
     >>> with Progress("Counting", 3, style="none") as progress:
     ...     progress.update(3, "all of them")
@@ -89,10 +84,7 @@ class Progress:
 
 
 def quiet_pybullet(otherwise: str) -> Any:
-    """The module pybullet, imported without the message that it prints.
-
-    Raises MissingDependencyError with the text ``otherwise`` where it is not installed.
-    """
+    """The module pybullet, imported without the message that it prints; MissingDependencyError of text ``otherwise``."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = os.dup(1), os.dup(2)

@@ -59,10 +59,7 @@ class StepTableLike(Protocol):
 
 @runtime_checkable
 class PriorLike(Protocol):
-    """A trained denoiser with its schedule, layout and normalizer.
-
-    All tensors are normalised scenes x (B, N, D).
-    """
+    """A trained denoiser with its schedule, layout and normalizer; all tensors are normalised scenes x (B, N, D)."""
 
     @property
     def scene_type(self) -> SceneType: ...
@@ -84,9 +81,8 @@ class PriorLike(Protocol):
         """``x`` with its known entries (fixed welded slots, constant features) set to their values."""
 
     def transition(self, x_t: Tensor, step: int, table: StepTableLike) -> Any:
-        """p(x_{t-1} | x_t) at ``table.timesteps[step]``, an object with ``from_noise(noise)``.
-
-        Known entries are certain; at the last step all entries are certain.
+        """p(x_{t-1} | x_t) at ``table.timesteps[step]``, an object with ``from_noise(noise)``. Known entries are
+        certain; at the last step all entries are certain.
         """
 
     def inpaint(
@@ -97,9 +93,8 @@ class PriorLike(Protocol):
 
 @runtime_checkable
 class EncodedPriorLike(PriorLike, Protocol):
-    """A prior that may denoise scenes in another layout than the scene type's, such as quaternions for rotations.
-
-    The last C + 1 features of a slot are its category in every layout.
+    """A prior that may denoise scenes in another layout than the scene type's, such as quaternions for rotations; the
+    last C + 1 features of a slot are its category in every layout.
     """
 
     @property
@@ -120,9 +115,8 @@ class LikelihoodPriorLike(PriorLike, Protocol):
     def pretraining_loss(
         self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None
     ) -> Tensor:
-        """(B,) training losses of x_0 (B, N, D) at timesteps ``t`` (B,) with ``reduction="none"``.
-
-        All noise comes from ``generator``.
+        """(B,) training losses of x_0 (B, N, D) at timesteps ``t`` (B,) with ``reduction="none"``; all noise comes from
+        ``generator``.
         """
 
 

@@ -25,10 +25,8 @@ _LOGGER = logging.getLogger(__name__)
 
 
 def plugin_entry_points(group: str) -> dict[str, EntryPoint]:
-    """The entry points of ``group`` by name, of all installed packages.
-
-    Entry points that the ``pyproject.toml`` of a checkout declares replace installed ones of the same name. The
-    metadata of an editable install may be out of date, and a checkout on the path has none.
+    """The entry points of ``group`` by name, of all installed packages. Those that the ``pyproject.toml`` of a checkout
+    declares replace installed ones, because the metadata of an editable install may be out of date or missing.
     """
     installed = {point.name: point for point in entry_points(group=group)}
     declared = _checkout_entry_points(Path(__file__).parents[1] / "pyproject.toml").get(group, {})
@@ -49,10 +47,8 @@ def _checkout_entry_points(pyproject: Path) -> dict[str, dict[str, str]]:
 
 @cache
 def load_plugins(group: str) -> None:
-    """Import every module of ``group``; each module registers its components when it is imported.
-
-    This happens once per process, when a name is not found. A plug-in that fails to import is reported in the log
-    and does not keep others from working.
+    """Import every module of ``group``, which registers its components, once per process, when a name is not found. A
+    plug-in that fails to import is reported in the log and does not keep others from working.
     """
     for point in plugin_entry_points(group).values():
         try:
@@ -62,14 +58,10 @@ def load_plugins(group: str) -> None:
 
 
 def load_plugin(point: EntryPoint) -> Any:
-    """Import the module of an entry point and return the object that the entry point names.
+    """Import the module of an entry point and return the object that it names; PluginError says why that failed.
 
-    ``sys.exit`` and ``os._exit`` at import end the import and not the process. An import that takes longer than
-    ``SCENE_ENVS_PLUGIN_SECONDS`` (60 by default) is ended. An import outside the main thread is not ended, nor is
-    compiled code that holds the interpreter.
-
-    Raises:
-        PluginError: the import failed; the message gives the reason.
+    ``sys.exit`` and ``os._exit`` end the import and not the process. It may take ``SCENE_ENVS_PLUGIN_SECONDS`` (60 by
+    default), but is not ended outside the main thread or in compiled code that holds the interpreter.
     """
     seconds = _seconds()
     try:
@@ -152,16 +144,9 @@ Component = TypeVar("Component")
 class Registry(dict[str, Component]):
     """Components of one kind by name; the lookup of a missing name first loads the module that registers it.
 
-    Args:
-        kind: Kind of the components in messages, such as ``"planner"``.
-        group: Group of entry points of installed packages.
-        components: Components that are registered from the start.
-        modules: Modules of this project, by name of the component that each registers when it is imported.
-        read: Function from the entry point with the name of a component to that component; None where the entry points
-            are modules that register components when they are imported.
-
-    Raises:
-        UnknownNameError: no component has the name of a lookup; the nearest known one is offered.
+    ``kind`` names them in messages ("planner"), ``group`` is the group of entry points of installed packages, and
+    ``modules`` are this project's, by name of the component that each registers at import. ``read`` makes a component
+    of its entry point; it is None where entry points are modules that register components. Raises UnknownNameError.
 
     >>> teas = Registry("tea", "doctest.teas", {"green": 80})
     >>> teas["green"], teas.names()
@@ -200,9 +185,8 @@ class Registry(dict[str, Component]):
         return self[name]
 
     def names(self) -> list[str]:
-        """All names, those of installed packages included, sorted.
-
-        Modules of this project are imported only where installed packages have modules that register components.
+        """All names, those of installed packages included, sorted. Modules of this project are imported only where
+        installed packages have modules that register components.
         """
         self._load_plugins()
         return sorted({*self, *self._modules, *(self.points() if self._read is not None else ())})
@@ -241,10 +225,9 @@ class Registry(dict[str, Component]):
 
 
 def lazy_names(package: str, file: str) -> Callable[[str], Any]:
-    """A module's ``__getattr__`` (PEP 562), which imports the names that the module lists under ``if TYPE_CHECKING:``.
-
-    Type checkers and readers see plain imports, which are the only list of names and of the modules that define them.
-    ``package`` and ``file`` are ``__name__`` and ``__file__`` of the module, whose source is read at the first lookup.
+    """A module's ``__getattr__`` (PEP 562), which imports the names that the module lists under ``if TYPE_CHECKING:``,
+    the only list of names and of the modules that define them. ``package`` and ``file`` are ``__name__`` and
+    ``__file__`` of the module, whose source is read at the first lookup.
     """
 
     @cache

@@ -12,13 +12,7 @@ from torch import Tensor
 
 
 def project_to_so3(matrices: Tensor) -> Tensor:
-    """Nearest rotation matrix in the Frobenius norm, by SVD in float64 (Levinson et al. 2020).
-
-    Args:
-        matrices: (..., 3, 3) real matrices, finite.
-
-    Returns:
-        (..., 3, 3) rotation matrices with determinant +1, same dtype.
+    """Nearest rotations (..., 3, 3) of finite matrices in the Frobenius norm, by SVD in float64 (Levinson et al. 2020).
 
     >>> project_to_so3(torch.diag(torch.tensor([2.0, 1.0, 0.5])))
     tensor([[1., 0., 0.],
@@ -50,10 +44,9 @@ def matrix_to_quaternion(matrices: Tensor) -> Tensor:
 
 
 def quaternion_to_matrix(quaternions: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of quaternions (w, x, y, z), normalised first.
-
-    The formula is written out, because ``roma`` rounds differently in float32. Priors with quaternion codes therefore
-    give the same bits as when they were trained.
+    """Rotation matrices (..., 3, 3) of quaternions (w, x, y, z), normalised first. The formula is written out, because
+    ``roma`` rounds differently in float32: so priors with quaternion codes give the same bits as when they were
+    trained.
     """
     w, x, y, z = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [

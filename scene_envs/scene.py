@@ -395,19 +395,16 @@ def scene_distances(batch: SceneBatch, other: SceneBatch) -> Tensor:
     """(B,) m: distance of each scene from its counterpart in ``other``, as sets of objects; orientations do not count.
 
     This is the OSPA distance of order 1 (Schuhmacher, Vo and Vo, 2008). Objects are matched one to one at the least
-    total cost. A match costs the distance of the two positions, at most c, or c when the assets differ. Each object
-    without a match costs c. The total is divided by the number of objects of the larger scene. Fixed welded objects
-    are left out; c is :func:`cutoff`. The assignment is exact: it is the limit of Sinkhorn iterations as their
-    regularisation goes to zero.
+    total cost. A match costs the distance of the two positions, at most c, or c when the assets differ; an object
+    without a match costs c, the :func:`cutoff`. The total is divided by the number of objects of the larger scene,
+    without fixed welded ones. The assignment is exact: the limit of Sinkhorn iterations as their regularisation goes to
+    zero. Raises InvalidInputError for another number of scenes, or scenes of other assets.
 
     >>> from scene_envs.grammars import get_grammar
     >>> scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 2)
     >>> shuffled = SceneBatch(scenes.tensor.flip(1), scenes.scene_type)
     >>> scene_distances(shuffled, scenes)
     tensor([0., 0.], dtype=torch.float64)
-
-    Raises:
-        InvalidInputError: another number of scenes, or scenes of other assets.
     """
     check_same_assets(batch, other)
     if len(batch) != len(other):

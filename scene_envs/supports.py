@@ -41,9 +41,8 @@ class Placed:
     def of_scenes(
         cls, scene_type: SceneType, categories: Tensor, translations: Tensor, rotations: Tensor
     ) -> tuple[LibraryShapes, Placed, Index]:
-        """The shapes of the assets, the objects of B scenes, and the slot of each object.
-
-        The arguments are categories (B, N), translations (B, N, 3) m and rotations (B, N, 3, 3).
+        """The shapes of the assets, the objects of B scenes, and the slot of each object, from categories (B, N),
+        translations (B, N, 3) m and rotations (B, N, 3, 3).
         """
         shapes = library_shapes(scene_type.library)
         scene, slot = np.nonzero((categories != scene_type.num_assets).cpu().numpy())
@@ -125,9 +124,8 @@ class Contacts:
         )
 
     def holding(self, tolerance: float = CONTACT) -> Holding:
-        """Supports of objects; surfaces touch when their gap or overlap is at most ``tolerance`` (m).
-
-        Place and tier of an object that touches nothing are found with three times the tolerance.
+        """Supports of objects; surfaces touch when their gap or overlap is at most ``tolerance`` (m). Place and tier of
+        an object that touches nothing are found with three times the tolerance.
         """
         support, contained, tier = self._lower(tolerance)
         far, _, far_tier = self._lower(_FAR * tolerance)

@@ -62,19 +62,12 @@ class WorkerFailure(Exception):
 
 @dataclass(frozen=True)
 class Task:
-    """One task of a pool.
+    """One task of a pool."""
 
-    Attributes:
-        body: argument of the target, picklable.
-        name: subject of messages about the task.
-        once: key and maker of a message that a worker must have answered before this task; sent once to each worker.
-        split: makes the smaller tasks that are tried when this one failed; None tries the task itself once more.
-    """
-
-    body: Any
-    name: str
-    once: tuple[Hashable, Callable[[], Any]] | None = None
-    split: Callable[[], Sequence[Task]] | None = None
+    body: Any  # argument of the target, picklable
+    name: str  # subject of messages about the task
+    once: tuple[Hashable, Callable[[], Any]] | None = None  # key and maker of what each worker must answer once, before
+    split: Callable[[], Sequence[Task]] | None = None  # makes smaller tasks to try after a failure; None tries again
 
 
 class _Target:
@@ -200,11 +193,8 @@ class _Worker:
         raise NotImplementedError
 
     def answer(self) -> Any:
-        """The answer to what was sent last, or to the start.
-
-        Raises:
-            WorkerFailure: there is none; a worker that was lost is not alive afterwards.
-            SceneEnvsError: as raised by the target.
+        """The answer to what was sent last, or to the start. Raises WorkerFailure where there is none (a lost worker is
+        not alive afterwards), and the target's SceneEnvsError.
         """
         kind = "report"
         try:
@@ -264,14 +254,10 @@ class _Worker:
 class Process(_Worker):
     """A worker process, and the two pipes to it.
 
-    Args:
-        target: ``"module:name"`` of what answers.
-        arguments: arguments with which the target makes what answers; None if the target itself answers.
-        memory: bytes that the process may allocate beyond what it needs to import the target (on Linux); None for any.
-        environment: variables that are added to the environment of this process.
-        stdout: descriptor that the process prints to.
-        stderr: descriptor that its messages go to; None for that of this process.
-        start_up: seconds that the process may take to start; None sets no limit.
+    ``target`` is ``"module:name"`` of what answers, or of its maker with the ``arguments`` (None: the target itself
+    answers). ``memory`` is the bytes that it may allocate beyond what the import of the target needs (on Linux);
+    ``environment`` are added variables. ``stdout`` and ``stderr`` are descriptors, None for this process's stderr;
+    ``start_up`` is the seconds that the start may take, None for no limit.
     """
 
     def __init__(
@@ -366,9 +352,8 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def run_apart(target: str, body: Any, timeout: float | None) -> Any:
-    """The answer of a target to one task, from a process of its own that may take ``timeout`` seconds in all.
-
-    Raises as :meth:`Process.answer`.
+    """The answer of a target to one task, from a process of its own that may take ``timeout`` seconds in all. Raises as
+    :meth:`Process.answer`.
     """
     end = None if timeout is None else time.monotonic() + timeout
     worker = Process(target, None, stderr=subprocess.DEVNULL, start_up=timeout)
@@ -448,23 +433,12 @@ _ray_users = 0
 class WorkerPool:
     """Workers that answer tasks; the results do not depend on their number.
 
-    A task that raises, ends its worker or takes too long is tried once more. Lost workers are replaced.
-
-    Args:
-        target: ``"module:name"`` of what answers.
-        arguments: arguments with which the target makes what answers; None if the target itself answers.
-        workers: number of processes; 0 computes in this process. With Ray, number of CPUs of a cluster that is started
-            here; None takes all CPUs of this machine.
-        timeout: seconds that a task may take; None sets no limit.
-        ray: whether workers are actors of a Ray cluster, as many as it has CPUs. The cluster is the one that this
-            process is connected to, or else the one at ``address`` or ``RAY_ADDRESS``, or else one that is started on
-            this machine and ends with the last pool.
-        address: address of a running Ray cluster.
-        options: further arguments of :class:`Process`.
-
-    Raises:
-        InvalidInputError: a number is out of range, or there is no cluster at the address.
-        MissingDependencyError: Ray is not installed.
+    A task that raises, ends its worker or takes more than ``timeout`` seconds (None: no limit) is tried once more. Lost
+    workers are replaced. ``target``, ``arguments`` and ``options`` are as for :class:`Process`. Of ``workers``
+    processes, 0 computes in this process. With ``ray``, workers are actors of a Ray cluster, as many as it has CPUs:
+    the cluster that this process is connected to, or else the one at ``address`` or ``RAY_ADDRESS``, or else one with
+    ``workers`` CPUs (None: all) on this machine, which ends with the last pool. Raises InvalidInputError for a number
+    out of range or no cluster at the address, and MissingDependencyError without Ray.
     """
 
     def __init__(
@@ -531,18 +505,10 @@ class WorkerPool:
         done: Callable[[Task, Any], None] | None = None,
         report: Callable[..., None] | None = None,
     ) -> list[Any]:
-        """The results of all tasks in order, a :class:`WorkerFailure` where a task failed twice.
-
-        In place of a task that was split stand the results of its parts.
-
-        Args:
-            tasks: the tasks.
-            done: called with each task and its result as soon as it is there.
-            report: called with the reports of workers.
-
-        Raises:
-            SceneEnvsError: as raised by the target; other tasks are given up.
-            PhysicsError: workers do not start, or the pool was closed.
+        """The results of all tasks in order, a :class:`WorkerFailure` where a task failed twice, and the results of its
+        parts in place of a task that was split. ``done`` is called with each task and its result at once, ``report``
+        with workers' reports. Raises the target's SceneEnvsError, other tasks being given up, and PhysicsError where
+        workers do not start or the pool was closed.
         """
         if self._closed:
             raise PhysicsError(f"this {type(self).__name__} was closed; make a new one")

@@ -181,14 +181,8 @@ def register_asset_group(name: str, assets: Iterable[str]) -> None:
 
 
 def categories_of(names: Sequence[str], library: AssetLibrary) -> tuple[int, ...]:
-    """Categories of ``library`` that ``names`` stand for, ascending.
-
-    Args:
-        names: Asset names, display names in prompts ("steamer lid") or groups of :data:`ASSET_GROUPS`.
-        library: Assets of a scene type.
-
-    Raises:
-        UnknownNameError: a name is none of these; the nearest known one is offered.
+    """Categories of ``library`` that ``names`` stand for, ascending: names of assets, display names in prompts
+    ("steamer lid") or groups of :data:`ASSET_GROUPS`. Raises UnknownNameError for any other name.
 
     >>> from scene_envs.assets import get_library
     >>> categories_of(["fruit", "cup"], get_library(("apple_red", "teacup", "teapot")))

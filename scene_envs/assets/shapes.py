@@ -38,11 +38,7 @@ class MassProperties(NamedTuple):
 
 
 def convex_hull(points: ArrayLike) -> ConvexPart:
-    """The hull of points (P, 3), with triangles facing outward.
-
-    Raises:
-        InvalidInputError: fewer than four points, or all in one plane.
-    """
+    """The hull of points (P, 3), triangles facing outward; InvalidInputError for fewer than four points or a plane."""
     cloud = np.asarray(points, dtype=np.float64)
     try:
         hull = ConvexHull(cloud)
@@ -81,12 +77,8 @@ def circle(segments: int, phase: float = 0.0) -> NDArray[np.float64]:
 
 
 def solid(profile: Profile, segments: int, phase: float = 0.0) -> ConvexPart:
-    """The convex hull of a half section revolved about z: cylinders, frusta, convex bodies.
-
-    Args:
-        profile: Points (r, z), m; r = 0 gives a single point.
-        segments: Number of corners of the polygon that replaces a circle.
-        phase: Angle of the first corner, rad.
+    """The convex hull of points (r, z) m revolved about z as a polygon of ``segments`` corners, the first at angle
+    ``phase`` (rad): cylinders, frusta, convex bodies; r = 0 gives a single point.
 
     >>> cylinder = solid([(0.1, 0.0), (0.1, 0.2)], 16)
     >>> len(cylinder.vertices), cylinder.bounds[1].round(3).tolist()
@@ -100,12 +92,8 @@ def solid(profile: Profile, segments: int, phase: float = 0.0) -> ConvexPart:
 
 
 def ring(profile: Profile, segments: int, phase: float = 0.0) -> list[ConvexPart]:
-    """A convex section swept about z as ``segments`` wedges that touch and do not overlap.
-
-    Args:
-        profile: Corners (r, z) of a convex section with r > 0, m.
-        segments: Number of wedges.
-        phase: Angle of the first joint, rad.
+    """A convex section of corners (r, z) m, r > 0, swept about z as ``segments`` wedges that touch and do not overlap;
+    the first joint is at angle ``phase`` (rad).
 
     >>> walls = ring([(0.10, 0.0), (0.12, 0.0), (0.12, 0.09), (0.10, 0.09)], 16)
     >>> len(walls), len(walls[0].vertices)
@@ -123,15 +111,8 @@ def ring(profile: Profile, segments: int, phase: float = 0.0) -> list[ConvexPart
 
 
 def rods(path: Sequence[tuple[float, float, float]], width: float, thickness: float) -> list[ConvexPart]:
-    """Boxes along a path in the x-z plane: handles and spouts.
-
-    Args:
-        path: P points (x, y, z), m, all with the same y.
-        width: Size along y, m.
-        thickness: Size across the path in the x-z plane, m.
-
-    Returns:
-        P - 1 parts; neighbours share their end faces, cut along the bisector (mitred).
+    """Boxes along a path of P points in the x-z plane (m, all with the same y): handles and spouts. ``width`` (m) is
+    along y, ``thickness`` (m) across the path. The P - 1 parts share their end faces, cut along the bisector (mitred).
     """
     points = np.asarray(path, dtype=np.float64)
     step = np.diff(points[:, [0, 2]], axis=0)
@@ -153,9 +134,8 @@ def volume(parts: Iterable[ConvexPart]) -> float:
 
 
 def mass_properties(parts: Iterable[ConvexPart], mass: float) -> MassProperties:
-    """Mass properties of the parts at one density, scaled to ``mass`` kg.
-
-    Exact integrals over the tetrahedra between the origin and each face. With ``mass`` 0 the inertia is 0.
+    """Mass properties of the parts at one density, scaled to ``mass`` kg: exact integrals over the tetrahedra between
+    the origin and each face. With ``mass`` 0 the inertia is 0.
     """
     triangles = np.concatenate([part.vertices[part.faces] for part in parts])  # (F, 3, 3)
     volumes = np.linalg.det(triangles) / 6.0
@@ -223,15 +203,9 @@ def grid_faces(rows: int, around: int) -> NDArray[np.int64]:
 def lathe(
     profile: Profile, colors: Color | Sequence[Color], *, segments: int = 48, phase: float = 0.0, flat: bool = False
 ) -> trimesh.Trimesh:
-    """Revolve an open or closed polyline of P points about z.
-
-    Args:
-        profile: Points (r, z), m, with the outside on the right: upward on the outside of a vessel, downward on its
-            inside.
-        colors: One colour, or one per span (P - 1).
-        segments: Number of facets around the axis.
-        phase: Angle of the first corner, rad.
-        flat: Whether facets stay visible (square dishes).
+    """Revolve an open or closed polyline of P points (r, z) m about z, with the outside on its right: upward on the
+    outside of a vessel, downward on its inside. ``colors`` are one, or P - 1 of the spans; ``phase`` (rad) is the angle
+    of the first corner; ``flat`` keeps facets visible (square dishes).
     """
     points = np.asarray(profile, dtype=np.float64)
     steps = np.diff(points, axis=0)
@@ -286,10 +260,8 @@ def tube(path: ArrayLike, radii: ArrayLike, color: Color, *, sides: int = 10) ->
 def planks(
     radius: float, z: float, colors: Sequence[Color], *, count: int, rows: int, columns: int = 6
 ) -> trimesh.Trimesh:
-    """A round board seen from above: ``count`` strips along y in turning colours.
-
-    Each strip is cut into ``rows`` x ``columns`` compact cells, because software renderers walk the
-    bounding box of each triangle.
+    """A round board seen from above: ``count`` strips along y in turning colours, each cut into ``rows`` x ``columns``
+    compact cells, because software renderers walk the bounding box of each triangle.
     """
     edges = np.linspace(-radius, radius, count + 1)
     along = np.linspace(-1.0, 1.0, rows + 1)
@@ -333,14 +305,8 @@ class Patch(NamedTuple):
 def painted_face(
     corner: ArrayLike, along: ArrayLike, up: ArrayLike, color: Color, patches: Sequence[Patch] = ()
 ) -> trimesh.Trimesh:
-    """A rectangle with patches on it; later patches cover earlier ones.
-
-    Args:
-        corner: (3,) lower left corner, m.
-        along: (3,) vector from there to the lower right corner, m.
-        up: (3,) vector from there to the upper left corner, m; ``along x up`` points outward.
-        color: Colour of the background.
-        patches: Patches painted on the rectangle.
+    """A rectangle with patches on it, later ones over earlier ones: lower left ``corner`` (3,) m, and vectors (3,) m
+    ``along`` to the lower right and ``up`` to the upper left corner; ``along x up`` points outward.
     """
     start, right, rise = (np.asarray(v, dtype=np.float64) for v in (corner, along, up))
     across = np.unique(np.clip([0.0, 1.0, *(e for p in patches for e in (p.left, p.right))], 0.0, 1.0))
@@ -364,9 +330,8 @@ def painted_face(
 
 
 def _rectangles(owner: NDArray[np.int64]) -> dict[int, list[tuple[int, int, int, int]]]:
-    """Rectangles (left, low, right, high) of cells, by owner; ``right`` and ``high`` are exclusive.
-
-    Strips of one owner that have the same ends in successive rows are joined.
+    """Rectangles (left, low, right, high) of cells, by owner; ``right`` and ``high`` are exclusive. Strips of one owner
+    that have the same ends in successive rows are joined.
     """
     joined: dict[int, list[tuple[int, int, int, int]]] = {}
     open_strips: dict[tuple[int, int, int], int] = {}
@@ -391,14 +356,8 @@ def painted_box(
     base: tuple[float, float, float] = (0.0, 0.0, 0.0),
     front: Literal["-y", "+x"] = "-y",
 ) -> trimesh.Trimesh:
-    """An axis-aligned box with a colour, and optionally a pattern, per face.
-
-    Args:
-        size: (x, y, z) side lengths, m.
-        color: One colour, or one per face (all six).
-        art: Patches per face.
-        base: Centre of the bottom face, m.
-        front: Side from which the top is seen upright.
+    """An axis-aligned box of side lengths ``size`` (m) with one colour or one per face (all six), and patches per face;
+    ``base`` is the centre of the bottom face (m), ``front`` the side from which the top is seen upright.
     """
     colors = color if isinstance(color, Mapping) else dict.fromkeys(FACES, color)
     x, y, z = np.diag(np.asarray(size, dtype=np.float64))
@@ -430,9 +389,8 @@ def lettering(
 
 
 def loft(sections: ArrayLike, color: Color, *, caps: tuple[bool, bool] = (True, True)) -> trimesh.Trimesh:
-    """A smooth skin through P sections of K points each (P, K, 3), m, with flat caps at its first and last end.
-
-    The points run counter-clockwise when seen from the last section looking back at the first.
+    """A smooth skin through P sections of K points each (P, K, 3), m, with flat caps at its first and last end. The
+    points run counter-clockwise when seen from the last section looking back at the first.
     """
     grid = np.asarray(sections, dtype=np.float64)
     count, around = grid.shape[:2]

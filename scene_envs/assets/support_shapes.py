@@ -75,9 +75,8 @@ def library_shapes(library: AssetLibrary) -> LibraryShapes:
 
 
 def _maps(asset: Asset) -> tuple[Array, Array, Mask, Array, Array]:
-    """Height maps ``top``, ``wide``, ``covered``, ``low``, ``cell`` over the asset's outline.
-
-    Two cells and a centimetre of margin stay free all round.
+    """Height maps ``top``, ``wide``, ``covered``, ``low``, ``cell`` over the outline, two cells and 1 cm wider all
+    round.
     """
     low, high = asset.bounds[:, :2]
     margin = np.maximum(_WIDEN, 3.0 * (high - low) / (_GRID - 6))

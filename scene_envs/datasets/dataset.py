@@ -315,10 +315,8 @@ def to_union(batch: SceneBatch, union: SceneType) -> SceneBatch:
 
 
 def union_normalizer(normalizers: Sequence[Normalizer], union: SceneType) -> Normalizer:
-    """The normalizer of ``union`` whose range covers those of all ``normalizers`` of its types.
-
-    Poses take the widest range of any; a pose feature is constant when it is in all of them, at the same value.
-    One-hots take [0, 1].
+    """The normalizer of ``union`` whose range covers those of all ``normalizers`` of its types. Poses take the widest
+    range of any; a pose feature is constant when it is so in all, at the same value. One-hots take [0, 1].
     """
     if not normalizers:
         raise InvalidInputError("a union's normalizer needs at least one normalizer, got none")
@@ -351,22 +349,13 @@ def make_layout(
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Conversion of the files of one dataset to scenes of a scene type.
-
-    Attributes:
-        info: Metadata of the files.
-        scene_type: Scene type of the scenes.
-        aliases: Mapping of model paths, or their stems, to asset names.
-        fixed_tolerance: Largest distance (m, rotation entries) of a fixed object from the scene type's pose, which it
-            then gets. ``math.inf`` accepts any pose.
-        slots: N of the scenes; None takes that of the file.
-    """
+    """Conversion of the files of one dataset to scenes of a scene type."""
 
     info: DatasetInfo
     scene_type: SceneType
-    aliases: Mapping[str, str] = field(default_factory=dict)
-    fixed_tolerance: float = FIXED_TOLERANCE
-    slots: int | None = None
+    aliases: Mapping[str, str] = field(default_factory=dict)  # model paths, or their stems, to asset names
+    fixed_tolerance: float = FIXED_TOLERANCE  # m, rotation entries: largest distance from the pose it gets
+    slots: int | None = None  # N of the scenes; None takes that of the file
 
     @cached_property
     def _categories(self) -> Tensor:
@@ -374,9 +363,8 @@ class Layout:
 
     @property
     def normalizer(self) -> Normalizer:
-        """The files' normalizer with features in the order of the scene type.
-
-        Assets without a path in the files, or with several, are scaled like *empty*.
+        """The files' normalizer with features in the order of the scene type; assets without a path in the files, or
+        with several, are scaled like *empty*.
         """
         found = self._categories
         order = torch.full((self.scene_type.num_assets + 1,), len(self.info.model_paths))
@@ -389,10 +377,8 @@ class Layout:
 
     def scenes(self, rows: Rows) -> Tensor:
         """(M, N, D) float32 raw scenes of ``rows``: fixed objects in the first slots, exact one-hots and rotations.
-
-        Raises:
-            CorruptFileError: a value is not finite, a slot is not one-hot or has no rotation (row and slot named).
-            InvalidInputError: a fixed object is missing and no slot is empty, or stands elsewhere (row named).
+        Raises CorruptFileError for values not finite, not one-hot or without rotation, and InvalidInputError for a
+        fixed object that stands elsewhere, or is missing where no slot is empty.
         """
         values = torch.from_numpy(np.array(rows.scenes))  # a copy: arrow's memory is read-only
         if not len(values):
@@ -426,10 +412,9 @@ class Layout:
 
 
 def _place_fixed(batch: SceneBatch, tolerance: float, rows: Rows) -> SceneBatch:
-    """The scenes of ``rows`` with the scene type's fixed objects in the first slots, in order and in their exact poses.
-
-    Other objects keep their order. A fixed object that a scene lacks is added where a slot is empty; one that is
-    farther than ``tolerance`` (m, rotation entries) from its pose is refused.
+    """The scenes of ``rows`` with the scene type's fixed objects in the first slots, in order and in their exact poses;
+    the others keep their order. A missing fixed object is added where a slot is empty; one that is farther than
+    ``tolerance`` (m, rotation entries) from its pose is refused.
     """
     tensor = batch.tensor.clone()
     for slot, fixed in enumerate(batch.scene_type.fixed):
@@ -475,9 +460,8 @@ def _require_none(bad: Tensor, rows: Rows, what: str) -> None:
 
 
 def scene_keys(tensor: Tensor) -> Keys:
-    """(M,) keys of raw scenes (M, N, D): equal for the same objects in the same poses, in any order of slots.
-
-    Rows of a dataset that repeat a scene with another prompt share one key. The poses must be bit-equal.
+    """(M,) keys of raw scenes (M, N, D): equal for the same objects in bit-equal poses, in any order of slots. Rows of
+    a dataset that repeat a scene with another prompt share one key.
     """
     chunks = [_chunk_keys(chunk) for chunk in tensor.split(_KEYS_AT_ONCE)]
     return np.concatenate(chunks) if chunks else np.empty(0, dtype=np.uint64)
@@ -505,16 +489,8 @@ def mix_bits(values: Keys) -> Keys:
 class Part:
     """One of several disjoint parts of a dataset, decided scene by scene from the scene's key.
 
-    A scene stays in its part when the dataset grows or is read in another order. Rows that repeat a scene share its
-    part. The fractions are therefore only met on average.
-
-    Attributes:
-        fractions: Fractions of all parts, in order; they may sum to less than one.
-        index: Index of this part.
-        seed: Seed of the assignment, not negative.
-
-    Raises:
-        InvalidInputError: fractions, index or seed are not as described above.
+    A scene stays in its part when the dataset grows or is read in another order, and rows that repeat it share its
+    part; so the fractions are only met on average. Raises InvalidInputError for wrong fractions, index or seed.
 
     >>> keys = mix_bits(np.arange(10_000, dtype=np.uint64))
     >>> train, test = (Part((0.9, 0.1), index).contains(keys) for index in (0, 1))
@@ -522,9 +498,9 @@ class Part:
     (0, 10000, True)
     """
 
-    fractions: tuple[float, ...]
-    index: int
-    seed: int = 0
+    fractions: tuple[float, ...]  # of all parts, in order; their sum may be below 1
+    index: int  # of this part
+    seed: int = 0  # of the assignment, not negative
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fractions", check_fractions(self.fractions))

@@ -66,16 +66,8 @@ def write_bytes(path: Path, content: bytes) -> None:
 def write_shard(
     path: Path, scenes: NDArray[np.float32], prompt_sets: Sequence[tuple[str, ...]], notes: Mapping[str, Any]
 ) -> None:
-    """Write one parquet file atomically.
-
-    Args:
-        path: Path of the file.
-        scenes: (M, N, D) float32, normalised.
-        prompt_sets: Prompts of each of the M scenes; ``language_annotations`` is left out when all have one.
-        notes: JSON-able facts for the file's footer, such as reasons for rejected scenes.
-
-    Raises:
-        StorageError: the file cannot be written; nothing is left of it.
+    """Write M scenes (M, N, D), normalised, to one parquet file; StorageError where nothing could be written.
+    ``language_annotations`` is left out when every scene has one prompt; ``notes`` go to the file's footer as JSON.
     """
     write_bytes(path, encode_shard(scenes, prompt_sets, notes))
 
@@ -153,14 +145,9 @@ class Rows:
 
 
 def find_files(path: str | os.PathLike[str]) -> list[Path]:
-    """The data files of a dataset, in order.
-
-    ``path`` is a parquet or arrow file, a folder of them (or with them in ``data/``), or what
-    ``datasets.Dataset.save_to_disk`` wrote.
-
-    Raises:
-        InvalidInputError: there are no such files.
-        CorruptFileError: ``state.json`` cannot be read, or names missing files.
+    """The data files of a dataset, in order: ``path`` is a parquet or arrow file, a folder of them (or with them in
+    ``data/``), or what ``datasets.Dataset.save_to_disk`` wrote. Raises InvalidInputError where there are none, and
+    CorruptFileError for a ``state.json`` that cannot be read or names missing files.
     """
     path = Path(path)
     if path.is_file():
@@ -181,9 +168,8 @@ def find_files(path: str | os.PathLike[str]) -> list[Path]:
 
 
 def find_metadata(path: str | os.PathLike[str]) -> Path:
-    """``metadata.json`` in the folder of a dataset or file, or in the folder above (splits share one).
-
-    Without such a file, the result is its expected path in the folder.
+    """``metadata.json`` in the folder of a dataset or file, or in the folder above (splits share one); without such a
+    file, its expected path in the folder.
     """
     path = Path(path)
     folder = path if path.is_dir() else path.parent
@@ -192,10 +178,8 @@ def find_metadata(path: str | os.PathLike[str]) -> Path:
 
 
 def read_rows(file: Path, features: int) -> Iterator[Rows]:
-    """The rows of one file, whose slots have ``features`` features (D) in the file, a block at a time.
-
-    Raises:
-        CorruptFileError: it cannot be read, columns are missing, or scenes have another width or gaps.
+    """The rows of one file of D = ``features`` features per slot, a block at a time. Raises CorruptFileError where it
+    cannot be read, columns are missing, or scenes have another width or gaps.
     """
     place, start = str(file), 0
     if file.suffix == ".arrow":
@@ -219,13 +203,9 @@ def read_rows(file: Path, features: int) -> Iterator[Rows]:
 
 
 def to_rows(table: pa.Table, features: int, place: str, start: int = 0) -> Rows:
-    """Scenes and prompts of a table with the columns of a dataset.
-
-    ``scenes`` may be lists of lists, fixed-size lists, Hugging Face ``Array2D``, or one flat list per scene, of
-    half, single or double floats.
-
-    Raises:
-        CorruptFileError: columns are missing, or scenes are ragged, incomplete or of another width.
+    """Scenes and prompts of a table with the columns of a dataset. ``scenes`` may be lists of lists, fixed-size lists,
+    Hugging Face ``Array2D``, or one flat list per scene, of half, single or double floats. Raises CorruptFileError for
+    missing columns and for ragged or incomplete scenes or those of another width.
     """
     _columns(table.column_names, place)
     try:

@@ -222,11 +222,9 @@ def _pickled(factory: Any, inputs: tuple[Any, ...], is_ray: bool) -> bytes:
 
 
 class ShardMaker:
-    """Answers of a worker of a generation: whole shards.
-
-    Args:
-        inputs: maker of the grammar, its scene type, and state of the normalizer, pickled.
-        main: main module of the parent on the same machine, for which shards are written; None returns their bytes.
+    """Answers of a worker of a generation: whole shards. ``inputs`` are the pickled maker of the grammar, its scene
+    type and the normalizer's state; ``main`` is the parent's main module on the same machine, for which shards are
+    written, or None to return their bytes.
     """
 
     def __init__(self, inputs: bytes, main: dict[str, Any] | None) -> None:
@@ -302,10 +300,9 @@ def fixed_normalizer(grammar: Grammar) -> Normalizer:
     """The normalizer of a grammar's scenes, a function of the grammar alone.
 
     x and y take the workspace's range, one-hots [0, 1], and z the range of a sample of unverified scenes, empty slots
-    included. If any object of the sample is tilted, all nine rotation entries take [-1, 1]. If objects only turn about
-    z, the four entries that encode tilt are constant (they come back exactly), and the four of the turn take [-1, 1]
-    each if they vary. The sample has 128 scenes. As long as nothing in it is tilted it grows to 10,000 objects (4,096
-    scenes at most), so that a rare tilt is not missed.
+    included. All nine rotation entries take [-1, 1] if any object of the sample is tilted; else the four that encode
+    tilt are constant, and the four of the turn take [-1, 1] each if they vary. The sample of 128 scenes grows to 10,000
+    objects (4,096 scenes at most) while nothing is tilted, so that a rare tilt is not missed.
     """
     low, high, tilted = _ranges(grammar)
     grammar.reasons.clear()
@@ -390,18 +387,10 @@ def make_shard(
 ) -> Generator[tuple[int, int, dict[str, int]], None, bytes]:
     """Yield the progress after each chunk, as arguments of a ``Report``; return the bytes of the shard's parquet file.
 
-    Candidate k is drawn from a random generator of its own, seeded by (seed, shard, k), and the shard holds the first
-    ``job.size`` candidates that pass. So neither the size of chunks nor an interruption changes the result.
-
-    Args:
-        job: Specification of the shard.
-        grammar: Grammar that draws the candidates.
-        normalizer: Normalizer of the dataset.
-        journal: Verdicts of an earlier, interrupted attempt, which are not computed again; None keeps none.
-
-    Raises:
-        PhysicsError: too many candidates in a row fail.
-        StorageError: the journal cannot be written.
+    Candidate k has a random generator of its own, seeded by (seed, shard, k), and the shard holds the first
+    ``job.size`` candidates that pass; so neither chunks nor an interruption change the result. Verdicts in the
+    ``journal`` of an interrupted attempt are not computed again. Raises PhysicsError when too many candidates in a row
+    fail, and StorageError where the journal cannot be written.
     """
     known = journal.read() if journal is not None else []
     kept: list[Tensor] = []
@@ -530,15 +519,9 @@ class Journal:
 
 @contextmanager
 def generation_progress(title: str, done: int, count: int, show: bool | str) -> Iterator[Report]:
-    """A live bar with scenes/s and the most frequent reasons; yields the function that advances it.
-
-    On a terminal the bar is on stderr; elsewhere (a log file) a line is printed every 30 s.
-
-    Args:
-        title: Title of the bar.
-        done: Number of scenes that exist already.
-        count: Number of requested scenes.
-        show: Style of the display; True for a bar, False for none.
+    """A live bar with scenes/s and the most frequent reasons on stderr, or lines every 30 s where that is no terminal;
+    yields the function that advances it. ``done`` of ``count`` scenes exist already; ``show`` is a style, True for a
+    bar, False for none.
     """
     totals: Counter[str] = Counter()
     kept = 0

@@ -21,10 +21,8 @@ MAX_PENETRATION = 1e-3
 
 
 def bad_objects(scene: SceneBatch, score: Score) -> Tensor | None:
-    """(N,) bool: free objects that the objective blames, or None when it does not judge single objects.
-
-    An object is blamed when the objective's flag ``feasible`` is False for it or, lacking that flag, when its
-    credit per object is not positive.
+    """(N,) bool: free objects that the objective blames, or None when it does not judge single objects. It blames those
+    whose flag ``feasible`` is False or, lacking that flag, whose credit per object is not positive.
     """
     if "feasible" in score.object_flags:
         return scene.is_free[0] & ~score.object_flags["feasible"][0]
@@ -34,10 +32,8 @@ def bad_objects(scene: SceneBatch, score: Score) -> Tensor | None:
 
 
 def infeasible_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-    """The free objects that physics calls infeasible, under any objective; none when all are feasible.
-
-    The verdict is the objective's flag ``feasible`` where the objective has one. Otherwise it is the flag of the reward
-    ``feasible_objects``, which keeps its verdicts, so that no scene is simulated twice.
+    """The free objects that physics calls infeasible, under any objective; none when all are feasible. The verdict is
+    the flag ``feasible`` of the objective or, lacking it, of the reward ``feasible_objects``, which keeps its verdicts.
     """
     flags = score.object_flags.get("feasible")
     if flags is None:
@@ -63,10 +59,8 @@ def infeasible_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Gen
 
 
 def blamed_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-    """The free objects that the objective blames, and all empty slots.
-
-    With an objective that counts feasible objects this is :func:`infeasible_or_empty_mask`. Where the objective does
-    not judge single objects, or blames none of a full scene, it is :func:`random_mask`.
+    """The free objects that the objective blames, and all empty slots. This is :func:`infeasible_or_empty_mask` for a
+    count of feasible objects, and :func:`random_mask` where no single object is judged, or none of a full scene blamed.
     """
     bad = bad_objects(scene, score)
     if bad is None or not bool((bad | scene.is_empty[0]).any()):
@@ -105,11 +99,7 @@ class EmptyMask:
 
 @dataclass(frozen=True)
 class LowestScoringMask:
-    """The ``count`` free objects of the lowest credit, ties at random.
-
-    Raises:
-        InvalidInputError: the objective gives no credit per object.
-    """
+    """The ``count`` free objects of the lowest credit, ties at random; InvalidInputError without credits per object."""
 
     count: int = 4
 
@@ -131,12 +121,8 @@ class LowestScoringMask:
 
 @dataclass(frozen=True)
 class RegionMask:
-    """The free objects whose frames are in a box of the workspace, and some empty slots.
-
-    Args:
-        low: Smallest x, y, z, m.
-        high: Largest x, y, z, m.
-        empty: Number of empty slots that are added at random.
+    """The free objects whose frames are in a box of the workspace, from ``low`` to ``high`` (x, y, z, m), and ``empty``
+    random empty slots.
     """
 
     low: Sequence[float] = (-np.inf, -np.inf, -np.inf)
@@ -173,10 +159,8 @@ class ExplicitMask:
 
 @dataclass(frozen=True)
 class OffPromptMask:
-    """Objects that contradict a prompt, and empty slots for objects that are missing.
-
-    These are the objects beyond the numbers in the prompt, both objects of a relation that does not hold, and one empty
-    slot for each missing object. Without a ``prompt`` of its own, the mask takes the prompt of the search.
+    """The objects beyond the numbers in the prompt, both objects of a relation that does not hold, and one empty slot
+    for each missing object. Without a ``prompt`` of its own, the mask takes the prompt of the search.
     """
 
     prompt: str | None = None
@@ -186,10 +170,8 @@ class OffPromptMask:
         return self if self.prompt is not None else OffPromptMask(prompt)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated; none when the scene follows the prompt.
-
-        Raises:
-            InvalidInputError: there is no prompt, or it cannot be read.
+        """(N,) bool, True where a slot is regenerated; none when the scene follows the prompt. Raises InvalidInputError
+        where there is no prompt, or it cannot be read.
         """
         from scene_envs.datasets import parse_prompt, scene_facts
 
@@ -217,17 +199,15 @@ class OffPromptMask:
 class CulpritsMask:
     """A smallest set of objects whose replacement ends all overlaps, and a few empty slots.
 
-    An objective that counts feasible objects blames both objects of an overlapping pair, but it is enough to replace
-    one of them. Objects with most overlaps are masked first, until no two unmasked objects overlap. Blamed objects that
-    overlap nothing (they fall or slide) are masked too. If these are fewer than ``at_least`` slots, random empty slots
-    are added, so that good scenes can grow. With an objective that does not judge single objects, ``at_least``
-    random slots are masked.
+    It is enough to replace one object of an overlapping pair, though the objective blames both. Objects with most
+    overlaps are masked first, until no two unmasked objects overlap, and so are blamed objects that overlap nothing
+    (they fall or slide). Random empty slots are added up to ``at_least``, so that good scenes can grow. With an
+    objective that does not judge single objects, ``at_least`` random slots are masked, and a scene without free objects
+    is regenerated whole.
 
     The number of masked slots should be small. At high noise the observed objects are noisy as well, so the masked
     slots get their usual share of objects, regardless of the observed ones. If all empty slots are masked, inpainting
     by clamping therefore adds too many objects and spoils the observed ones.
-
-    A scene without free objects is regenerated whole.
     """
 
     at_least: int = 4
@@ -380,11 +360,8 @@ def list_masks() -> list[str]:
 
 
 def resolve_mask(mask: Any) -> MaskGenerator:
-    """A mask generator from its name, a mapping of its name and settings, or a function of that form.
-
-    Raises:
-        UnknownNameError: no mask generator has that name, or it has no such setting; the nearest known is offered.
-        InvalidInputError: ``mask`` is none of these.
+    """A mask generator from its name, a mapping of its name and settings, or a function of that form. Raises
+    UnknownNameError for an unknown name or setting, and InvalidInputError for anything else.
 
     >>> resolve_mask({"name": "lowest_scoring", "count": 2})
     LowestScoringMask(count=2)
@@ -409,11 +386,7 @@ def mask_for_prompt(generator: MaskGenerator, prompt: str | None) -> MaskGenerat
 
 
 def masked_slots(generator: MaskGenerator, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-    """(N,) bool: the mask that a generator gives for a batch of one.
-
-    Raises:
-        InvalidInputError: the generator raised an error, or returned something else.
-    """
+    """(N,) bool: the mask that a generator gives for a batch of one; InvalidInputError if it fails or is no mask."""
     name = getattr(generator, "__name__", type(generator).__name__)
     slots = scene.tensor.shape[1]
     try:

@@ -36,11 +36,8 @@ def resolve_reward(reward: Any) -> SceneScorer:
 
 
 def resolve_prior(prior: Any) -> PriorLike:
-    """A prior from a name or a path; any other value is returned unchanged.
-
-    Raises:
-        UnknownNameError: no shipped prior has that name; the nearest known one is offered.
-        MissingDependencyError: no installed package resolves priors.
+    """A prior from a name or a path; any other value is returned unchanged. Raises UnknownNameError for no shipped
+    prior of that name, and MissingDependencyError where no installed package resolves priors.
     """
     return _resolver("prior")(prior) if isinstance(prior, str) else prior
 
@@ -93,12 +90,8 @@ class Score:
 
 
 class RewardScorer:
-    """Scorer of batches of scenes on the CPU, with a reward that is resolved once.
-
-    Args:
-        reward: Registered name, mapping with its settings, function or reward object.
-        workers: Number of physics worker processes, started at the first scoring; 0 computes in this process, ``"ray"``
-            on a Ray cluster.
+    """Scorer of batches of scenes on the CPU; its reward, a name, mapping, function or object, is resolved once. The
+    ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
 
     >>> scorer = RewardScorer("object_count")
     >>> scorer(SceneBatch.empty("dimsum_table", 2)).valid.tolist()
@@ -171,20 +164,10 @@ _MAX_ROWS = 4096
 class EnvPrompts:
     """The prompts of an environment's episodes.
 
-    Args:
-        prior: Prior of the environment.
-        prompt: None for no prompts; one prompt; a list to draw from; or ``"grammar"`` (or ``"data"``, which is the
-            same here) for descriptions of the grammar's scenes.
-        guidance: Weight w of classifier-free guidance in the prior's own steps.
-        slots: Number of slots per scene; a prompt that asks for more objects is refused.
-
-    Attributes:
-        guidance: Weight of classifier-free guidance.
-        given: Whether episodes have prompts.
-
-    Raises:
-        InvalidInputError: a prompt for a prior that reads none, guidance without a prompt, or a prompt that cannot be
-            followed.
+    ``prompt`` is None for none, one prompt, a list to draw from, or ``"grammar"`` (or ``"data"``, the same here) for
+    descriptions of the grammar's scenes. ``guidance`` is the weight w of classifier-free guidance in the prior's own
+    steps; ``given`` tells whether episodes have prompts. Raises InvalidInputError for prompts that the prior does not
+    read or that ask for more objects than ``slots`` per scene, and for guidance without a prompt.
 
     >>> from scene_envs.envs.scoring import resolve_prior
     >>> prompts = EnvPrompts(resolve_prior("dimsum_table"), ["A scene with two cups.", "A scene."], 0.0, 34)
@@ -231,10 +214,8 @@ class EnvPrompts:
         return choices[0] if len(choices) == 1 else choices[int(rng.integers(len(choices)))]
 
     def read(self, prompts: Sequence[str]) -> Tensor:
-        """Token indices (B, L) int64 of prompts, on the CPU.
-
-        Raises:
-            InvalidInputError: a prompt is too long or asks for more objects than there are slots.
+        """Token indices (B, L) int64 of prompts, on the CPU. Raises InvalidInputError where a prompt is too long or
+        asks for more objects than there are slots.
         """
         if self.reader is None:
             raise InvalidInputError(f"a prior of {self._prior.scene_type.name!r} without text reads no prompts")
@@ -262,10 +243,8 @@ def _choices(prompt: Any) -> tuple[str, ...] | None:
 
 @lru_cache(maxsize=16)
 def grammar_prompts(scene_type: SceneType, slots: int) -> tuple[str, ...]:
-    """Descriptions of all kinds of scenes of the type's grammar; the same at every call.
-
-    Raises:
-        InvalidInputError: the grammar makes no scene of so few slots.
+    """Descriptions of all kinds of scenes of the type's grammar, the same at every call. Raises InvalidInputError where
+    the grammar makes no scene of so few slots.
     """
     from scene_envs.datasets.prompts import describe_all
     from scene_envs.grammars import get_grammar

@@ -171,11 +171,7 @@ class SearchMaskSettings(TreeSettings):
 
 
 def check_claim_guidance(prompt: Any, strength: Any) -> None:
-    """Refuse claim guidance that is no number of at least 0, or has no prompt; ``""`` is no prompt.
-
-    Raises:
-        InvalidInputError: the message names the value and the remedy.
-    """
+    """Refuse (InvalidInputError) claim guidance that is no number of at least 0, or has no prompt; ``""`` is none."""
     if not _is_finite(strength) or strength < 0:
         raise InvalidInputError(
             f"claim_guidance={_shown(strength)} must be a finite number of at least 0; 0 guides nothing"
@@ -188,11 +184,7 @@ def check_claim_guidance(prompt: Any, strength: Any) -> None:
 
 
 def check_physics_guidance(strength: Any, scene_type: SceneType | None = None) -> None:
-    """Refuse physics guidance that is not a number from 0 to 1, or of scenes whose assets have no geometry.
-
-    Raises:
-        InvalidInputError: the message names the value and the remedy.
-    """
+    """Refuse (InvalidInputError) physics guidance that is no number from 0 to 1, or of assets without geometry."""
     if not _is_finite(strength) or not 0 <= strength <= 1:
         raise InvalidInputError(
             f"physics_guidance={_shown(strength)} must be a number from 0 to 1; 0 guides nothing, and 1 moves objects "

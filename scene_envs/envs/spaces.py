@@ -26,9 +26,8 @@ STATE_BOUND = 10.0
 
 
 def resolve_scene_and_prior(scene: str | SceneType | None, prior: Any) -> tuple[SceneType, PriorLike]:
-    """The scene type, and its prior: the given one, or the shipped one of the scene type's name.
-
-    Without a scene type, that of the prior is taken; without both, ``dimsum_table``.
+    """The scene type, and its prior: the given one, or the shipped one of the scene type's name. Without a scene type,
+    that of the prior is taken; without both, ``dimsum_table``.
     """
     if scene is None and prior is None:
         scene = DEFAULT_SCENE
@@ -79,9 +78,8 @@ def decode_scenes(prior: PriorLike, x: Tensor) -> SceneBatch:
 
 
 def occupied(x: Tensor, scene_type: SceneType) -> Tensor:
-    """(B, N) int8: 1 where the arg-max category of normalised or raw scenes (B, N, D) is not *empty*.
-
-    Slots whose category is not drawn yet (rows of zeros, from a mixed prior) count as empty.
+    """(B, N) int8: 1 where the arg-max category of normalised or raw scenes (B, N, D) is not *empty*. Slots whose
+    category is not drawn yet (rows of zeros, from a mixed prior) count as empty.
     """
     category = x[..., -(scene_type.num_assets + 1) :]
     drawn = (category != 0).any(dim=-1)
@@ -89,15 +87,9 @@ def occupied(x: Tensor, scene_type: SceneType) -> Tensor:
 
 
 def check_action(action: Any, shape: tuple[int, ...], axes: tuple[str, ...]) -> Tensor:
-    """``action`` as a finite tensor of ``shape`` and of torch's default dtype, float32 unless a program changes it.
-
-    Args:
-        action: Any array-like value.
-        shape: Required shape.
-        axes: Names of the dimensions, for the message.
-
-    Raises:
-        InvalidInputError: wrong shape, or a value that is not finite (the first one is named).
+    """``action``, anything array-like, as a finite tensor of ``shape`` and of torch's default dtype, float32 unless a
+    program changes it. Raises InvalidInputError for another shape (``axes`` names its dimensions) or a value that is
+    not finite.
     """
     try:
         tensor = action if isinstance(action, Tensor) else torch.from_numpy(np.asarray(action, dtype=np.float32))

@@ -113,11 +113,7 @@ def list_formats() -> list[str]:
 
 def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     """Names of formats, each once, from one name, several, or ``"all"`` (those registered that can be written here).
-
-    Raises:
-        UnknownNameError: no such format.
-        MissingDependencyError: one needs a package that is not installed.
-        InvalidInputError: none are given.
+    Raises UnknownNameError, MissingDependencyError for a format without its package, and InvalidInputError for none.
 
     >>> resolve_formats(["mjcf", "npz", "mjcf"])
     ('mjcf', 'npz')

@@ -17,12 +17,9 @@ Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.
 
 
 def scene_arrays(scene: PlacedScene) -> dict[str, Any]:
-    """Arrays of both files, for the n objects of a scene in slot order.
-
-    Returns:
-        ``translations`` (n, 3) float64 m, ``rotations`` (n, 3, 3) float64, ``categories`` (n,) int64, ``slots`` (n,)
-        int64, ``welded`` (n,) bool, ``names`` (n,) text, ``asset_names`` (C,) text in category order, and
-        ``scene_type``, one text.
+    """Arrays of both files, for the n objects of a scene in slot order: ``translations`` (n, 3) float64 m,
+    ``rotations`` (n, 3, 3) float64, ``categories`` and ``slots`` (n,) int64, ``welded`` (n,) bool, ``names`` (n,) text,
+    ``asset_names`` (C,) text in category order, and ``scene_type``, one text.
     """
     objects = scene.objects
     return {

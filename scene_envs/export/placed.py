@@ -151,9 +151,8 @@ def identifier(name: str) -> str:
 
 
 def exact_rotations(matrices: NDArray[np.floating]) -> Array:
-    """Nearest rotations (..., 3, 3) in double precision, orthonormal to a few 1e-16.
-
-    The SVD leaves an error of some 1e-16 per entry; one Newton step of the polar decomposition halves it.
+    """Nearest rotations (..., 3, 3) in double precision, orthonormal to a few 1e-16. The SVD leaves an error of some
+    1e-16 per entry; one Newton step of the polar decomposition halves it.
     """
     rotation: Array = project_to_so3(torch.from_numpy(np.asarray(matrices, dtype=np.float64))).numpy()
     return rotation @ (1.5 * np.eye(3) - 0.5 * rotation.swapaxes(-1, -2) @ rotation)  # type: ignore[no-any-return]
@@ -165,9 +164,7 @@ def quaternion(rotation: Array) -> Array:
 
 
 def angle_axis(rotation: Array) -> tuple[float, Array]:
-    """Angle (degrees, 0..180) and unit axis (3,) of a rotation (3, 3).
-
-    Unlike Euler angles, they are well defined at every rotation.
+    """Angle (degrees, 0..180) and unit axis (3,) of a rotation (3, 3); unlike Euler angles, always well defined.
 
     >>> angle, axis = angle_axis(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]))
     >>> round(angle, 12), axis.round(12).tolist()

@@ -53,10 +53,8 @@ def bullet_urdf(asset: Asset, files: AssetFiles) -> Path:
 
 
 def drake_contact(asset: Asset, friction: float) -> dict[str, float | None]:
-    """Contact properties for Drake, tag to value.
-
-    Contact is hydroelastic, over a patch. Drake's point contact has only one point per pair of parts, on which a box
-    rocks. Static assets are rigid, all others compliant.
+    """Contact properties for Drake, tag to value. Contact is hydroelastic, over a patch, because Drake's point contact
+    has only one point per pair of parts, on which a box rocks. Static assets are rigid, all others compliant.
     """
     shape: dict[str, float | None] = {"rigid_hydroelastic": None}
     if not asset.static:

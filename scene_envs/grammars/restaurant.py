@@ -26,10 +26,9 @@ WALL = Line((-4.75, -3.0), (-4.75, 3.0))
 
 
 def chairs() -> Node:
-    """Four chairs around a table, one on each side and facing it, in the frame of the table.
-
-    The places have the same spread as in the paper, 7 cm toward the table and 17 cm along it, but no tails. A table
-    without room for its chairs is placed somewhere else.
+    """Four chairs around a table, one on each side and facing it, in the frame of the table. They have the same spread
+    as in the paper, 7 cm toward the table and 17 cm along it, but no tails; a table without room for them is placed
+    elsewhere.
     """
     chair = Object("chair", Uniform(0.12, 0.29, x=1.12), Yaw(0.14, (math.pi,)))
     center = Gaussian(along=0.0)
@@ -46,14 +45,10 @@ def laid(
     dishes: float = 0.6,
     teapots: float = 0.9,
 ) -> Node:
-    """A table with its chairs, places, stacks of steamers, dishes and teapots.
+    """A table with its chairs, places, ``stacks`` of steamers, dishes and teapots (each the chance of one or two).
 
-    Args:
-        stacks: Distribution of the number of stacks of steamers.
-        another, lid, nothing: Weights of another steamer, a lid and nothing after each steamer.
-        setting, empty: Weights of a plate with a cup, and of nothing, on each side of the table; a plate alone and
-            a cup alone have 0.05 each.
-        dishes, teapots: Chances of one or two of them.
+    ``another``, ``lid`` and ``nothing`` are the weights of what follows a steamer; ``setting`` (a plate with a cup) and
+    ``empty`` those at each side of the table, where a plate alone and a cup alone have 0.05 each.
     """
     then = {"steamer_bottom": another, "steamer_lid": lid, None: nothing}
     steamers = Repeat(Stack("steamer_bottom", then, step=dimsum.STEP, where=Gaussian(along=0.158), at_most=10), stacks)

@@ -88,12 +88,8 @@ def drinks(asset: str, p: float) -> Node:
 
 
 def tier_objects(toy: float, game: float, p: float) -> Node:
-    """Objects of one tier.
-
-    Args:
-        toy: Chance of the book and of each toy.
-        game: Chance of small games and of a plate.
-        p: Parameter of the geometric distributions of the numbers of game cases, cans and bottles.
+    """Objects of one tier: ``toy`` is the chance of the book and of each toy, ``game`` that of small games and of a
+    plate, ``p`` the parameter of the geometric distributions of the numbers of game cases, cans and bottles.
     """
     return Group(
         maybe(toy, bookend()),

@@ -30,11 +30,8 @@ def run_kernel(
     kernel: str, batch: SceneBatch, options: dict[str, Any], pool: PhysicsPool | None, units: Tensor | None = None
 ) -> Rows:
     """Run a kernel of :data:`~scene_envs.physics.kernels.KERNELS`: results of each scene, None where it failed twice.
-
-    ``units`` (B,) float64 are those that the simulation of each scene may spend; None derives them from its objects.
-
-    Raises:
-        InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
+    ``units`` (B,) float64 may be spent by the simulation of each scene; None derives them from its objects.
+    InvalidInputError names scene and slot of a pose that is not finite or a matrix that is no rotation.
     """
     require_rigid_poses(batch)
     translations = batch.translations.double().cpu().numpy()

@@ -61,13 +61,10 @@ _STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
 class BodyPool:
     """Bodies of one asset library in a PyBullet client of their own.
 
-    Two properties keep the motion of a scene independent of the scenes before it. The broadphase is Bullet's simple
-    one: it keeps no tree, and lists pairs in the order of the bodies. And a body that is placed or parked gets a
-    fresh broadphase proxy, which drops its pairs, contacts and warm starts.
-
-    Raises:
-        MissingDependencyError: pybullet is not installed.
-        PhysicsError: PyBullet has no free client slot.
+    The motion of a scene is independent of the scenes before it for two reasons: the broadphase is Bullet's simple one,
+    which keeps no tree and lists pairs in the order of the bodies; and a body that is placed or parked gets a fresh
+    proxy, which drops its pairs, contacts and warm starts. Raises MissingDependencyError without pybullet, and
+    PhysicsError without a free client slot.
     """
 
     def __init__(self, library: LibraryGeometry) -> None:
@@ -87,11 +84,7 @@ class BodyPool:
         self.axes = np.array([axes for _, axes in principal])  # (C, 3, 3) principal axes of each asset, columns
 
     def take(self, needed: Mapping[BodyKey, int]) -> dict[BodyKey, list[int]]:
-        """The first ``needed[key]`` parked bodies of each key, independently of earlier calls.
-
-        Raises:
-            PhysicsError: PyBullet refuses a shape or a body.
-        """
+        """The first ``needed[key]`` parked bodies of each key, whatever calls came before; may raise PhysicsError."""
         have = sum(len(bodies) for bodies in self._bodies.values())
         missing = any(len(self._bodies.get(key, ())) < count for key, count in needed.items())
         if missing or have > _SPARE_FACTOR * sum(needed.values()) + _SPARE_BODIES:
@@ -231,11 +224,8 @@ class SolverSettings:
 class World:
     """PyBullet for one asset library; the motion of a scene depends on that scene alone, bit for bit.
 
-    The order in which bodies are sorted, placed and parked does not depend on the slot order, and bodies never sleep.
-    Threads take turns. A call that is interrupted leaves no bodies behind.
-
-    Raises:
-        MissingDependencyError: pybullet is not installed.
+    Bodies are sorted, placed and parked in an order that does not depend on the slots, and never sleep. Threads take
+    turns. A call that is interrupted leaves no bodies behind. Raises as :class:`BodyPool`.
     """
 
     def __init__(self, library: LibraryGeometry) -> None:
@@ -249,12 +239,9 @@ class World:
         """Move the objects (n,) of one scene for ``duration`` seconds under gravity.
 
         Objects that are ``fine`` (n,) collide with their fine parts. A cluster of free objects, those of one number in
-        ``group`` (n,), leaves the simulation when it is at rest. When ``budget`` is spent, all stay where they are.
-
-        Returns:
-            rotation (n, 3, 3) and translation (n, 3) m afterwards, the angle turned (n,) in radians, and the objects
-            (n,) that left before the end: those at rest, or all when the budget was spent. Objects that Bullet lost to
-            a numerical failure come back as NaN.
+        ``group`` (n,), leaves the simulation at rest; when ``budget`` is spent, all leave it where they are. Returns
+        rotation (n, 3, 3), translation (n, 3) m, the angle turned (n,) rad, and the objects (n,) that left before the
+        end. Objects that Bullet lost to a numerical failure come back as NaN.
         """
         with self._lock:
             try:

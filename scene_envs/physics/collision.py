@@ -36,10 +36,8 @@ _TOO_MANY = 20_000_000
 
 
 class PenetrationDepth:
-    """Penetration depth of pairs of convex parts at any poses.
-
-    Args:
-        parts: Corners (V, 3) of each part in its own frame, m; points inside the hull are ignored.
+    """Penetration depth of pairs of convex parts at any poses, from the corners (V, 3) m of each part in its own frame;
+    points inside the hull are ignored.
     """
 
     def __init__(self, parts: Sequence[Array]) -> None:
@@ -66,12 +64,10 @@ class PenetrationDepth:
             self._tables[int(index)] = np.stack(padded).transpose(2, 0, 1).copy()
 
     def __call__(self, placed: PlacedParts, first: Index, second: Index) -> tuple[Array, Array]:
-        """Depth of each pair of placed parts, given as two arrays (P,) of rows of ``placed``.
+        """Depth (P,) m and direction (P, 3) of pairs of placed parts, given as two arrays (P,) of rows of ``placed``.
 
-        Returns:
-            depth (P,) m, the distance that the second part has to move, along ``direction``, until the two only touch;
-            and that direction (P, 3), a unit vector in the world. Where the parts are apart, minus the depth is the gap
-            between them along ``direction``, at most their distance. NaN where a pose has a NaN.
+        The second part has to move by the depth along the direction, a unit vector in the world, until the two only
+        touch. Where they are apart, minus the depth is the gap along it, at most their distance. NaN poses give NaN.
         """
         depth, direction = np.empty(len(first)), np.empty((len(first), 3))
         a, b = placed.part[first], placed.part[second]
@@ -165,9 +161,8 @@ class _Ragged:
 
 class _Halves:
     """Pairs seen from both sides: half ``2 p`` belongs to the first part of pair ``p``, half ``2 p + 1`` to the second.
-
-    Of each half, ``owner`` (2 P,) is the part whose features are tested, ``other`` (2 P,) the other one. ``turn``
-    (3, 3, 2 P) and ``move`` (3, 2 P) m lead from the frame of the owner to that of the other.
+    In each, features of the part ``owner`` (2 P,) are tested, not of ``other`` (2 P,); ``turn`` (3, 3, 2 P) and
+    ``move`` (3, 2 P) m lead from the frame of the owner to that of the other.
     """
 
     def __init__(self, placed: PlacedParts, first: Index, second: Index) -> None:
@@ -182,8 +177,7 @@ class _Halves:
 
 
 class _Faces:
-    """The faces of the owners of half pairs, from ``start`` (2 P,) of each half on, with their ``normal`` (n,) index.
-
+    """The faces of the owners of half pairs, from ``start`` (2 P,) of each half on, with their ``normal`` (n,) index;
     ``support`` (n,) is the number of the deepest corner of the other part under each face.
     """
 
@@ -310,9 +304,8 @@ class Collider:
         self.depth = PenetrationDepth([part.vertices for part in library.parts])
 
     def pairs(self, objects: Objects, *, totals: bool = False) -> ObjectPairs:
-        """Near pairs of objects within each of one or more scenes; two fixed objects are never a pair.
-
-        With ``totals`` the depths of all part pairs are summed as well, the literature's per-geometry measure.
+        """Near pairs of objects within each of one or more scenes; two fixed objects are never a pair. With ``totals``
+        the depths of all part pairs are summed as well, the literature's per-geometry measure.
         """
         coarse = place(self.library, objects, "coarse")
         low, high = object_boxes(coarse)
@@ -408,9 +401,8 @@ def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, secon
 
 def _rounds(target: Index, bound: Array, depth: Array, every: bool) -> Iterator[Index]:
     """Rows of candidates that can still deepen their object pair; twice as many per pair in each round, or all at once.
-
-    The candidates of an object pair ``target`` (Q,) stand together, and the upper bounds ``bound`` (Q,) m of their
-    depths descend. The caller updates ``depth`` (P,) m, the depths found so far, between rounds.
+    Candidates of an object pair ``target`` (Q,) stand together, with descending upper bounds ``bound`` (Q,) m of their
+    depths. Between rounds, the caller updates ``depth`` (P,) m, the depths found so far.
     """
     rows = np.arange(len(target))
     if every:

@@ -34,18 +34,13 @@ _CHUNK = 16
 
 
 def corrections(batch: SceneBatch, spread: Array, movable: Mask | None = None) -> Tensor:
-    """Moves (B, N, 3), m, that reduce overlap and floating: one round for each scene.
+    """Moves (B, N, 3), m, that reduce overlap and floating: one round for each scene of a batch on the CPU.
 
-    First, overlapping pieces of generated furniture move apart along the floor, together with the objects on them.
-    Then overlapping objects move apart by a least-distance problem, as in :func:`~scene_envs.physics.project`.
-    Distances are measured in standard deviations of the positions, so objects move along the axes on which they are
-    uncertain. Last, each object moves straight down onto the object less than 3 cm below it. Rotations and the fixed
-    objects of the scene type stay.
-
-    Args:
-        batch: B scenes of N slots, on the CPU, with finite poses.
-        spread: (3,) standard deviations of the positions along the axes of the world; only their ratios matter.
-        movable: (B, N) bool, slots whose objects may move; None for all.
+    First, overlapping pieces of generated furniture move apart along the floor, together with the objects on them. Then
+    overlapping objects move apart by a least-distance problem, as in :func:`~scene_envs.physics.project`, at distances
+    in units of ``spread`` (3,), the standard deviations of positions along the world's axes (only their ratios matter).
+    Last, each object moves straight down onto the object less than 3 cm below it. Rotations, fixed objects and those
+    that are not ``movable`` (B, N) stay; poses must be finite.
 
     >>> corrections(SceneBatch.empty("dimsum_table", 1), np.ones(3)).abs().max()
     tensor(0.)
@@ -75,9 +70,8 @@ def corrections(batch: SceneBatch, spread: Array, movable: Mask | None = None) -
 def falls(collider: Collider, objects: Objects, limit: float) -> Array:
     """(n,) m, distance that each free object falls until it meets another one; 0 where it exceeds ``limit``.
 
-    Objects (n,) of one or more scenes fall straight down, without turning, the lowest ones first, so that an object
-    follows its support. Fixed objects do not fall. The distance follows from the face planes of the fine parts, and is
-    at most the true one.
+    Objects of one or more scenes fall straight down, without turning, the lowest first, so that each follows its
+    support. The distance follows from the face planes of the fine parts, and is at most the true one.
     """
     low, high = object_boxes(place(collider.library, objects, "coarse"))
     first, second = scene_pairs(objects)

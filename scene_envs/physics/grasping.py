@@ -34,28 +34,17 @@ PART_PAIRS = 35_000.0
 class Gripper:
     """A parallel gripper of boxes; the defaults are about those of a Franka hand. All lengths in m.
 
-    Attributes:
-        opening: Distance between the open fingers.
-        finger_length: Size of a finger along the approach.
-        finger_width: Size of a finger across the approach and the closing direction.
-        finger_thickness: Size of a finger along the closing direction.
-        palm: Size (along the closing direction, across it) of the body above the fingers.
-        path: Length of the free space that the palm needs behind it along the approach.
-        reaches: Depths of the fingertips below the near side of the object, in the order in which they are tried; the
-            fingertips go no deeper than its far side.
-
-    Raises:
-        InvalidInputError: a length is not positive, the palm is narrower than the open fingers, or a reach is longer
-            than the fingers.
+    Raises InvalidInputError for a length that is not positive, a palm narrower than the open fingers, or a reach longer
+    than the fingers.
     """
 
-    opening: float = 0.08
-    finger_length: float = 0.045
-    finger_width: float = 0.02
-    finger_thickness: float = 0.008
-    palm: tuple[float, float] = (0.2, 0.06)
-    path: float = 0.15
-    reaches: tuple[float, ...] = (0.03, 0.01)
+    opening: float = 0.08  # distance between the open fingers
+    finger_length: float = 0.045  # along the approach
+    finger_width: float = 0.02  # across the approach and the closing direction
+    finger_thickness: float = 0.008  # along the closing direction
+    palm: tuple[float, float] = (0.2, 0.06)  # body above the fingers, along the closing direction and across it
+    path: float = 0.15  # free space that the palm needs behind it along the approach
+    reaches: tuple[float, ...] = (0.03, 0.01)  # of the tips below the near side, not past the far side, in turn
 
     def __post_init__(self) -> None:
         lengths = (self.opening, self.finger_length, self.finger_width, self.finger_thickness, *self.palm, self.path)
@@ -67,10 +56,7 @@ class Gripper:
             raise InvalidInputError(f"{self}: reaches {self.reaches} must not be longer than the fingers")
 
     def body(self) -> tuple[ConvexPart, ...]:
-        """The two fingers, and the palm with its path.
-
-        z points back along the approach, x is the closing direction, and the fingertips are at z = 0.
-        """
+        """The two fingers, and the palm with its path; x is the closing direction, z points back from the fingertips."""
         aside = 0.5 * (self.opening + self.finger_thickness)
         finger = (self.finger_thickness, self.finger_width, self.finger_length)
         palm = (*self.palm, self.path)
@@ -83,28 +69,19 @@ class Gripper:
 
 @dataclass(frozen=True, eq=False)
 class ReachResult:
-    """Objects that a gripper reaches.
+    """Objects that a gripper reaches."""
 
-    Attributes:
-        reached: (A, B, N) bool, for each approach; False for welded and empty slots.
-        valid: (B,) bool; False for scenes, such as heaps of objects, that would take more work than a scene may.
-    """
-
-    reached: Tensor
-    valid: Tensor
+    reached: Tensor  # (A, B, N) bool, for each approach; False for welded and empty slots
+    valid: Tensor  # (B,) bool; False for scenes, such as heaps, of too much work
 
 
 def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper: Gripper | None = None) -> ReachResult:
-    """Objects that an open gripper reaches in a straight line without touching anything.
+    """Objects of B scenes that an open gripper reaches in a straight line without touching anything.
 
-    For each approach the gripper is tried at the middle and at both edges of the object, with four closing directions
-    and all reaches. It reaches the object when a part of the object is between the fingers, and when the fingers, the
-    palm and the path of the palm overlap no object by more than 0.1 mm (fine convex parts, exact depths).
-
-    Args:
-        batch: B scenes of N slots.
-        approaches: A directions in the world from the objects to the gripper before the approach, such as (0, 0, 1).
-        gripper: Sizes of the gripper; None takes the default ones.
+    For each of A ``approaches``, directions in the world from the object to the waiting gripper, such as (0, 0, 1), it
+    is tried at the middle and both edges of the object, with four closing directions and all reaches. It reaches the
+    object when a part of it is between the fingers, and fingers, palm and the palm's path overlap no object by more
+    than 0.1 mm (fine convex parts, exact depths).
     """
     gripper = Gripper() if gripper is None else gripper
     found = torch.zeros(len(approaches), *batch.tensor.shape[:2], dtype=torch.bool)
@@ -138,9 +115,8 @@ class _Hand:
         self.corners = [np.concatenate([part.vertices for part in asset.fine]) for asset in library]
 
     def reach(self, objects: Objects, back: Array, budget: Budget) -> Index:
-        """Rows of the free objects of one scene that the gripper reaches from the direction ``back`` (3,).
-
-        ``budget`` counts pairs of convex parts; when it is spent, the result is not valid.
+        """Rows of the free objects of one scene that the gripper reaches from the direction ``back`` (3,). ``budget``
+        counts pairs of convex parts; when it is spent, the result is not valid.
         """
         free = np.flatnonzero(~objects.fixed)
         if not len(free):
@@ -160,9 +136,8 @@ class _Hand:
         return np.setdiff1d(free, open_rows)
 
     def _extents(self, objects: Objects, rows: Index, back: Array) -> tuple[Index, Array, Array, Array]:
-        """Gripper frames for some objects: owner (G,), rotation (G, 3, 3) to the world, and the owner's extents in it.
-
-        The extents are the lowest and highest coordinates (G, 3), (G, 3) m along the axes of the gripper.
+        """Gripper frames for some objects: owner (G,), rotation (G, 3, 3) to the world, and the owner's lowest and
+        highest coordinates (G, 3), (G, 3) m along the axes of the gripper.
         """
         rotation = _frames(objects.rotation[rows], back)  # (n, T, 3, 3)
         low, high = np.empty(rotation.shape[:3]), np.empty(rotation.shape[:3])
@@ -215,9 +190,8 @@ _hand = lru_cache(maxsize=16)(_Hand)
 
 
 def _frames(rotation: Array, back: Array) -> Array:
-    """(n, T, 3, 3) gripper to world: z along ``back`` (3,), x turned by :data:`TURNS` from an axis of each object.
-
-    The axis is the object's x or z axis, whichever is closer to perpendicular to ``back``, made perpendicular to it.
+    """(n, T, 3, 3) gripper to world: z along ``back`` (3,), x turned by :data:`TURNS` from the x or z axis of each
+    object, whichever is closer to perpendicular to ``back``, made perpendicular to it.
     """
     axes = rotation[:, :, [0, 2]].swapaxes(1, 2)  # (n, 2, 3)
     across = axes - (axes @ back)[..., None] * back

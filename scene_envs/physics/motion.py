@@ -92,10 +92,9 @@ def motion(
     budgets: Sequence[Budget],
     tilt: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Array, Array, Index]:
-    """Displacement (n,) m and rotation (n,) rad of the objects of several scenes in ``duration`` seconds.
-
-    Also returns the scenes whose simulation diverged or was too much work: ``budgets`` hold the units that each may
-    spend. ``tilt`` is the (x, y) angles (rad) by which gravity is tilted in simulations.
+    """Displacement (n,) m and rotation (n,) rad of the objects of several scenes in ``duration`` seconds, and the
+    scenes whose simulation diverged or needed more than the units in its budget. ``tilt`` is the (x, y) angles (rad) by
+    which gravity is tilted in simulations.
     """
     rest = physics.rest(objects, pairs, duration)
     displacement, rotation = np.abs(rest.rise), rest.tilt.copy()
@@ -124,15 +123,12 @@ def advance(
     settling: int | None = None,
     tilt: tuple[float, float] = (0.0, 0.0),
 ) -> Moved:
-    """The objects of one scene ``duration`` seconds later.
+    """The objects of one scene ``duration`` seconds later, or at the poses reached when ``budget`` is spent.
 
-    Objects at rest get the pose of their closed form; all others are simulated with the objects they touch. When a
-    simulated object reaches an object that was not simulated, or that had come to rest and left the simulation, the two
-    are simulated again together.
-
-    When ``budget`` is spent, objects stay at the poses reached. ``settling`` is the number of solver iterations per
-    step of a damped motion; None simulates undamped, and doubtful motion again with other settings. ``tilt`` is the
-    (x, y) angles (rad) by which gravity is tilted in simulations.
+    Objects at rest get the pose of their closed form; all others are simulated with the objects they touch. When one of
+    these reaches an object that was not simulated, or had come to rest and left, the two are simulated again together.
+    ``settling`` is the number of solver iterations per step of a damped motion; None simulates undamped, and doubtful
+    motion again with other settings. ``tilt`` is as for :func:`motion`.
     """
     translation = objects.translation.copy()
     translation[:, 2] += rest.rise
@@ -248,10 +244,9 @@ def settle_scene(
     bottom: float,
     budget: Budget,
 ) -> tuple[Array, Array, bool]:
-    """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether they stayed finite.
-
-    The motion lasts at most ``duration`` seconds. Objects below the height ``bottom`` (m) are simulated no further, and
-    when ``budget`` is spent, all stay at the poses reached.
+    """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether they stayed finite. This takes
+    at most ``duration`` seconds. Objects below the height ``bottom`` (m) are simulated no further, and when ``budget``
+    is spent, all stay at the poses reached.
     """
     current = objects
     calm = np.zeros(len(objects), dtype=bool)  # was simulated, and did not move

@@ -75,10 +75,9 @@ class ContactFace:
 
 
 def contact_face(fine: Sequence[PartGeometry], coarse: Sequence[PartGeometry], side: int) -> ContactFace | None:
-    """The face at the lowest (``side`` -1) or highest (+1) z, or None.
-
-    The result is None also when the two levels of detail have different outlines there, or when the outline is not
-    solid all the way round (four legs). In these cases fine and coarse parts support objects differently.
+    """The face at the lowest (``side`` -1) or highest (+1) z. It is None where there is none, where the two levels of
+    detail have different outlines, or where the outline is not solid all round (four legs), because fine and coarse
+    parts then support objects differently.
     """
     height = side * max(float((side * part.vertices[:, 2]).max()) for part in fine)
     polygons = [polygon for part in fine if (polygon := _flat_corners(part, height)) is not None]
@@ -131,10 +130,8 @@ def _outside(points: Array, polygon: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PartFeatures:
-    """Features of one convex part, asset frame.
-
-    A part without thickness has two opposite faces, whose edges are those of the polygon; a line is a polygon of two
-    equal edges, and a point has no edges.
+    """Features of one convex part, asset frame. A part without thickness has two opposite faces, whose edges are those
+    of the polygon; a line is a polygon of two equal edges, and a point has no edges.
     """
 
     corners: Array  # (V, 3) corners of the hull, m
@@ -297,10 +294,8 @@ def padded(rows: Sequence[Array]) -> Array:
 
 
 def inset_hull(part: PartGeometry, distance: float) -> Array:
-    """Corners (V, 3) of the part with every face moved inward by ``distance`` (m).
-
-    Bullet enlarges convex meshes by its margin, so a hull that is smaller by the margin acts at its true size.
-    A part too thin for the whole distance is inset by two fifths of its thickness.
+    """Corners (V, 3) of the part with every face moved inward by ``distance`` (m), by two fifths of the thickness if it
+    is too thin. Bullet enlarges convex meshes by its margin, so that a hull smaller by it acts at its true size.
     """
     from scipy.optimize import linprog
 

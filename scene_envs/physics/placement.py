@@ -46,11 +46,9 @@ def rotate(rotation: Array, points: Array) -> Array:
 
 
 def separations(library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index) -> tuple[Array, Array]:
-    """Largest signed gap of each pair of ``placed`` parts, rows (P,), over all face directions of both.
-
-    Returns:
-        gap (P,) m, positive when a face plane separates the pair, and the direction (P, 3) of that plane in the world,
-        from the first part to the second. The true distance is at least ``gap``, the true depth at most ``-gap``.
+    """Largest signed gap of each pair of ``placed`` parts, rows (P,), over all face directions of both: gap (P,) m,
+    positive when a face plane separates the pair, and its direction (P, 3) in the world, from first to second. The true
+    distance is at least ``gap``, the true depth at most ``-gap``.
     """
     gap = np.empty(len(first))
     direction = np.empty((len(first), 3))
@@ -92,12 +90,9 @@ def _faces_and_corners(
 def grouped_gaps(
     library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index, shift: Array
 ) -> Iterator[tuple[Index, Array, Array]]:
-    """Signed gaps of pairs of ``placed`` parts, rows (P,), over *all* face directions of both, in groups of equal size.
-
-    ``shift`` (P, 3) m leads from the origin of the first part's object to the origin of the second part's object.
-
-    Yields:
-        rows (Q,) of the pairs, gaps (Q, K) m, and directions (Q, K, 3) in the world, from first to second.
+    """Signed gaps of pairs of ``placed`` parts, rows (P,), over *all* face directions of both, in groups of equal size:
+    yields rows (Q,), gaps (Q, K) m and directions (Q, K, 3) in the world, from first to second. ``shift`` (P, 3) m
+    leads from the origin of the first part's object to that of the second part's object.
     """
     for rows, a, b in _groups(library, placed, first, second):
         one, two = first[rows], second[rows]
@@ -208,10 +203,8 @@ def object_boxes(placed: PlacedObjects) -> tuple[Array, Array]:
 
 
 def part_pairs(placed: PlacedObjects, first: Index, second: Index) -> tuple[Index, Index, Index]:
-    """All pairs of parts of the object pairs (``first``, ``second``), both (P,).
-
-    Returns:
-        index (Q,) of the object pair, and the two parts (Q,), (Q,) as rows of ``placed.parts``.
+    """All pairs of parts of the object pairs (``first``, ``second``), both (P,): index (Q,) of the object pair, and the
+    two parts (Q,), (Q,) as rows of ``placed.parts``.
     """
     sizes = placed.count[first] * placed.count[second]
     pair = np.repeat(np.arange(len(first)), sizes)
@@ -274,10 +267,8 @@ class ObjectPairs:
 
 @dataclass
 class Budget:
-    """Units of work that a search or a simulation may spend.
-
-    A unit of a search is one tested pair of convex parts. A unit of simulation is one free object over one step of
-    35 solver iterations: about 0.05 ms, several times that where objects are deep in each other.
+    """Units of work that a search or a simulation may spend: one tested pair of convex parts, or one free object over
+    one step of 35 solver iterations (about 0.05 ms, several times that where objects are deep in each other).
     """
 
     limit: float  # number of units at which the work ends

@@ -260,9 +260,8 @@ def _walls(bounds: tuple[Array, Array]) -> Planes:
 
 
 def heaps(collider: Collider, objects: Objects) -> Mask:
-    """(n,) free objects of one scene in groups that overlap so much that exact tests would take too long.
-
-    Objects nested as intended meet as many others but hardly overlap, so they are no heap.
+    """(n,) free objects of one scene in groups that overlap so much that exact tests would take too long. Objects
+    nested as intended meet as many others but hardly overlap, so they are no heap.
     """
     low, high = object_boxes(place(collider.library, objects, "coarse"))
     first, second = scene_pairs(objects)
@@ -298,9 +297,9 @@ def _separating_planes(
 ) -> Planes:
     """Planes that keep object pairs (P,) of one scene apart; ``budget`` is charged with one unit per plane.
 
-    Every pair of parts gets a face plane that separates the two parts now. Among several such planes the one with the
-    least move away from ``home`` (n, 3) m is taken. Coarse parts are used where they are already apart, fine ones
-    elsewhere. ``extra`` (P, 3) m is added to the offset of each pair: the minimum translation of those that overlap.
+    Every pair of parts gets the face plane that separates the two now with the least move away from ``home`` (n, 3) m:
+    of coarse parts where they are already apart, of fine ones elsewhere. ``extra`` (P, 3) m is added to the offset of
+    each pair: the minimum translation of those that overlap.
     """
     coarse, pair, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
     budget.spent += len(pair)
@@ -338,10 +337,9 @@ def _planes_at(
 
 
 def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget, cost: Array | None = None) -> Array:
-    """Translations (n, 3) nearest to ``home`` that satisfy the planes as well as possible.
-
-    Groups of objects that no plane connects are solved separately. ``budget`` is charged with the rows solved.
-    ``cost`` (3,) is the cost of a metre along each axis of the world; None means 1.
+    """Translations (n, 3) nearest to ``home`` that satisfy the planes as well as possible. Groups of objects that no
+    plane connects are solved separately; ``budget`` is charged with the rows solved. ``cost`` (3,) is that of a metre
+    along each axis of the world; None means 1.
     """
     if cost is not None:
         direction = planes.direction / cost
@@ -373,10 +371,9 @@ def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget, cost:
 def least_distance(matrix: Array, needed: Array, budget: Budget) -> Array:
     """The shortest x with ``matrix @ x + s >= needed``, slack s costing ``_SLACK`` squared.
 
-    Lawson and Hanson's least-distance programme (1974, ch. 23) through non-negative least squares on its dual.
-    Most rows hold anyway, so a row joins the problem only when a solution without the row violates it. Problems of
-    more than ``_EXACT`` rows, and those on which the exact method fails, are solved approximately. When ``budget`` is
-    spent, the last solution is returned.
+    Lawson and Hanson's least-distance programme (1974, ch. 23) through non-negative least squares on its dual. Most
+    rows hold anyway, so a row joins only when a solution without it violates it. Problems of more than ``_EXACT`` rows,
+    and those on which the exact method fails, are solved approximately. A spent ``budget`` ends with the last solution.
     """
     x = np.zeros(matrix.shape[1])
     used = needed > 0
@@ -405,9 +402,8 @@ def _exact(matrix: Array, needed: Array) -> Array:
 
 
 def _approximate(matrix: Array, needed: Array) -> Array:
-    """Solution after a set number of steps of accelerated projected gradient ascent on the dual.
-
-    FISTA (Beck and Teboulle, 2009), started again whenever its momentum points downhill (O'Donoghue and Candes, 2015).
+    """Solution after a set number of steps of accelerated projected gradient ascent on the dual: FISTA (Beck and
+    Teboulle, 2009), started again whenever its momentum points downhill (O'Donoghue and Candes, 2015).
     """
     sparse = csr_array(matrix)
     transposed = csr_array(matrix.T)
@@ -437,9 +433,8 @@ def _minimum_translations(
     cost: Array | None = None,
 ) -> Array:
     """(P, 3) m: translations that free overlapping object pairs when they are added to the offsets of the pairs.
-
-    Directions that were ``tried`` and did not help cost more; the directions of the result are added to them. ``cost``
-    (3,) is that of a metre along each axis of the world. ``budget`` is charged with one unit per pair of parts.
+    Directions ``tried`` in vain cost more, and those of the result join them. ``cost`` (3,) is that of a metre along
+    each axis of the world; ``budget`` is charged with one unit per pair of parts.
     """
     placed = place(collider.library, objects, "fine")
     pair, a, b = part_pairs(placed, first, second)
@@ -466,10 +461,8 @@ def _minimum_translations(
 
 
 def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array, walk: Array) -> Array:
-    """(P, D, 3) directions to try.
-
-    They are the axes, the level directions away from and toward the other object, face normals of the overlapping
-    parts, and the direction of ``walk``.
+    """(P, D, 3) directions to try: the axes, the level directions away from and toward the other object, face normals
+    of the overlapping parts, and the direction of ``walk``.
     """
     directions = np.zeros((count, 9 + 2 * _OWN, 3))
     directions[:, :6] = _AXES
@@ -507,9 +500,8 @@ def _walk(
     groups: list[tuple[Index, Array, Array]],
     bounds: tuple[Array, Array],
 ) -> Array:
-    """(P, 3) m: sum of several steps, each out of the part that is then the deepest; leads out of corners.
-
-    From fixed objects, steps down and steps out of the workspace are avoided.
+    """(P, 3) m: sum of several steps, each out of the part that is then the deepest; leads out of corners. From fixed
+    objects, steps down and steps out of the workspace are avoided.
     """
     free = np.where(objects.fixed[first], second, first)
     sign = np.where(objects.fixed[first], 1.0, -1.0)
@@ -606,9 +598,8 @@ def _weights(
 def _spread(
     library: LibraryGeometry, objects: Objects, chosen: Mask, wanted: Array, bounds: tuple[Array, Array]
 ) -> Array:
-    """Translations (n, 3) m, near the ``wanted`` ones (n, 3), at which the boxes of the chosen objects meet no other.
-
-    Where there is no room, they meet as few others as possible. Objects that are not chosen stay.
+    """Translations (n, 3) m, near the ``wanted`` ones (n, 3), at which the boxes of the chosen objects meet no other,
+    or as few as possible where there is no room. Objects that are not chosen stay.
     """
     coarse = place(library, objects, "coarse")
     low, high = object_boxes(coarse)
@@ -633,9 +624,8 @@ def _spread(
 
 
 def _free_place(wanted: Array, low: Array, high: Array, weight: Index, limits: tuple[Array, Array]) -> Array:
-    """The place (3,) near ``wanted`` that lies in the fewest of the blocked open boxes ``low``, ``high`` (M, 3).
-
-    It lies in none of them if there is such a place. A box counts as ``weight`` (M,) boxes.
+    """The place (3,) near ``wanted`` that lies in the fewest of the blocked open boxes ``low``, ``high`` (M, 3), in
+    none if there is such a place. A box counts as ``weight`` (M,) boxes.
     """
     found = wanted
     for reach in _WINDOWS:

@@ -150,11 +150,9 @@ def _make_ready_once(
 
 
 def _judge_round(batch: SceneBatch, units: Tensor, pool: PhysicsPool | None) -> tuple[Tensor, Tensor]:
-    """(B, N) free objects that stay in the trials of a round, and (B,) whether all objects stayed in all trials.
-
-    Only scenes in which every free object in the workspace stays in the shorter trials go through the others: first
-    tilted gravity, then the longest trial. Scenes that fail have another round. The work done is subtracted from
-    ``units`` (B,), in place.
+    """(B, N) free objects that stay in the trials of a round, and (B,) whether all objects stayed in all trials. Only
+    scenes in which every free object in the workspace stays in the shorter trials go on to tilted gravity, then the
+    longest trial; others have another round. The work done is subtracted from ``units`` (B,), in place.
     """
     candidates = batch.is_free & batch.in_workspace
     ready = _strike(batch, candidates & (units > 0)[:, None], _UPRIGHT, units, pool)
@@ -183,8 +181,7 @@ def _strike(
 
 def _strike_until_still(batch: SceneBatch, ready: Tensor, units: Tensor, pool: PhysicsPool | None) -> Tensor:
     """``ready`` (B, N) without the objects that move in the longest trial, which is repeated where it removed objects.
-
-    Where the repeated trial removes objects again, all objects that moved in it by ``_UNMOVED`` or more are removed.
+    If it removes objects again, all that moved in it by ``_UNMOVED`` or more are removed.
     """
     ready = ready.clone()
     scenes = ready.any(dim=-1).nonzero()[:, 0]

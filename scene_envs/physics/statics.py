@@ -301,11 +301,9 @@ class Support:
         return fine & self.hollow[objects.category]
 
     def differs(self, objects: Objects, pairs: ObjectPairs) -> Mask:
-        """(P,) pairs whose coarse parts do not carry each other as the fine ones do.
-
-        Coarse shapes act like fine ones in three kinds of contact. The solid outlines of two facing flat faces meet
-        all the way round; or an object lies on a flat surface that is larger than it; or two upright objects are side
-        by side.
+        """(P,) pairs whose coarse parts do not carry each other as the fine ones do. They do in three kinds of contact:
+        the solid outlines of two facing flat faces meet all the way round; an object lies on a flat surface that is
+        larger than it; or two upright objects are side by side.
         """
         a, b = pairs.first, pairs.second
         relevant = (pairs.gap < _REACH) & (self.hollow[objects.category[a]] | self.hollow[objects.category[b]])
@@ -373,9 +371,8 @@ def components(count: int, first: Index, second: Index) -> Index:
 
 
 def company(objects: Objects, pairs: ObjectPairs, chosen: Mask) -> Mask:
-    """(n,) free objects that must be simulated with the ``chosen`` ones.
-
-    These are objects that touch or nearly touch a chosen object, and the objects on or under those.
+    """(n,) free objects that must be simulated with the ``chosen`` ones: those that touch or nearly touch a chosen
+    object, and the objects on or under those.
     """
     free = ~(objects.fixed[pairs.first] | objects.fixed[pairs.second]) & (pairs.gap < _REACH)
     first, second = pairs.first[free], pairs.second[free]

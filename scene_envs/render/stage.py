@@ -182,9 +182,8 @@ get_stage = cache(Stage)
 
 
 def make_palette(codes: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], int]:
-    """At most ``limit`` colours (0xRRGGBB, sorted) that replace ``codes``, and the mask of the bits they keep.
-
-    Colours are exact as long as they fit. If there are more (in scans), the lowest bits of each channel are dropped.
+    """At most ``limit`` colours (0xRRGGBB, sorted) that replace ``codes``, and the mask of the bits they keep. Colours
+    are exact as long as they fit; of more (in scans), the lowest bits of each channel are dropped.
     """
     for bits in range(8, 0, -1):
         channel = (0xFF << (8 - bits)) & 0xFF
@@ -234,9 +233,9 @@ class Framing:
 def frame_scene_type(scene_type: SceneType) -> Framing:
     """Framing of scenes of this type.
 
-    A support that rises through the workspace (a shelf) is seen whole, from its open side and slightly above. A support
-    that is open above (a bin) is seen steeply from above. If objects stand on a support (a table, a floor) or on
-    nothing, the view is a three-quarter view from above, across the longer side; it is steeper for flatter workspaces.
+    A support that rises through the workspace (a shelf) is seen whole, from its open side and slightly above; one that
+    is open above (a bin) steeply from above. On a table or floor, or without support, the view is a three-quarter view
+    from above, across the longer side, steeper for flatter workspaces.
     """
     low, high = (np.array(corner) for corner in scene_type.workspace)
     extent = high - low
@@ -262,11 +261,10 @@ def frame_scene_type(scene_type: SceneType) -> Framing:
 
 
 def scene_type_of_one(scene_type: SceneType, translations: Array, rotations: Array, categories: Index) -> SceneType:
-    """Scene type for the framing of one scene, in which its only support counts as fixed.
+    """Scene type for the framing of one scene, in which its only welded object, if it has one, counts as fixed there.
 
-    A union of scene types has no fixed objects and the workspace of the largest type, in which a table would be tiny. A
-    scene with one welded object is framed as if this object were fixed there; any other scene is framed as
-    ``scene_type``. Poses are (N, 3) m and (N, 3, 3); empty slots have the number of assets as category (N,).
+    A union of scene types has no fixed objects and the workspace of the largest type, in which a table would be tiny.
+    Poses are (N, 3) m and (N, 3, 3); empty slots have the number of assets as category (N,).
     """
     names = np.array([*scene_type.assets, ""])[categories]
     supports = np.flatnonzero(np.isin(names, scene_type.welded))
@@ -290,10 +288,9 @@ def scene_type_of_one(scene_type: SceneType, translations: Array, rotations: Arr
 
 
 def fit_camera(points: Array, to_camera: Array, fov_y: float, aspect: float, margin: float) -> tuple[Array, Array]:
-    """Position and target (m) of the nearest camera without roll that sees all points (P, 3) m.
-
-    ``to_camera`` (3,) is a unit vector from the scene to the camera, not vertical; ``fov_y`` the vertical field of view
-    in degrees; ``aspect`` width to height; ``margin`` the share of the half image that stays free at each border.
+    """Position and target (m) of the nearest camera without roll that sees all points (P, 3) m. ``to_camera`` (3,) is a
+    unit vector from the scene, not vertical; ``fov_y`` the vertical field of view in degrees; ``aspect`` width to
+    height; ``margin`` the share of the half image that stays free at each border.
     """
     right = np.cross(_TOP, to_camera)
     right /= np.linalg.norm(right)
@@ -405,9 +402,8 @@ def camera_points(frame: Frame) -> Image:
 
 
 def surface_normals(frame: Frame) -> Image:
-    """(H, W, 3): unit normals in the camera frame, facing the camera; those of every second pixel are repeated.
-
-    Along each axis the difference to the nearer neighbour is taken, so that edges of objects stay sharp.
+    """(H, W, 3): unit normals in the camera frame, facing the camera; those of every second pixel are repeated. Along
+    each axis the difference to the nearer neighbour is taken, so that edges of objects stay sharp.
     """
     points = camera_points(frame)[::_STRIDE, ::_STRIDE]
     along = [_shorter(np.diff(points, axis=axis), axis) for axis in (1, 0)]
@@ -418,10 +414,9 @@ def surface_normals(frame: Frame) -> Image:
 
 
 def soft_shadow(frame: Frame, light: Frame, normals: Image, *, bias: float = 0.004, lift: float = 0.008) -> Image:
-    """(H, W) in 0..1: the part of the light that nearer objects hide, by percentage-closer filtering.
-
-    ``light`` is the frame of the same scene seen from the light. An occluder is nearer to it than the point by at least
-    ``bias`` (m). Points are raised off their surface by ``lift`` (m), so that no surface shadows itself.
+    """(H, W) in 0..1: the part of the light that nearer objects hide, by percentage-closer filtering in ``light``, the
+    frame seen from the light. An occluder is nearer to it than the point by at least ``bias`` (m). Points are raised
+    off their surface by ``lift`` (m), so that no surface shadows itself.
     """
     seen = np.isfinite(frame.depth)
     to_light = (light.view @ np.linalg.inv(frame.view)).astype(np.float32)
@@ -441,9 +436,8 @@ def soft_shadow(frame: Frame, light: Frame, normals: Image, *, bias: float = 0.0
 
 
 def contact_shade(frame: Frame, normals: Image, *, radius: float = 0.04) -> Image:
-    """(H, W) in 0..1: ambient occlusion of each point by its surroundings within ``radius`` m.
-
-    Computed for every second pixel of each axis and repeated; callers blur the result.
+    """(H, W) in 0..1: ambient occlusion of each point by its surroundings within ``radius`` m, computed for every
+    second pixel of each axis and repeated; callers blur the result.
     """
     grid = camera_points(frame)[::_STRIDE, ::_STRIDE]
     height, width = grid.shape[:2]

@@ -70,46 +70,26 @@ _SMALL, _LARGE = 2e-3, 20.0
 
 @dataclass(frozen=True)
 class AssetEntry:
-    """One asset of a library: its file, its names and how its file becomes a body.
+    """One asset of a library: its file, its names and how its file becomes a body."""
 
-    Attributes:
-        file: Path relative to the folder.
-        name: Identifier; the stem of the file by default.
-        display_name: Name in prompts; the identifier with spaces by default.
-        plural: Plural of the display name; the regular one by default.
-        scale: Factor on all lengths; a file in millimetres needs 0.001.
-        density: Density (kg/m^3) of the evenly filled shape.
-        mass: Mass, kg.
-        welded: Whether the asset is fixed to the world; the file decides by default.
-        up: Axis of the file that points up.
-        color: Class colour (r, g, b), also used for surfaces without a colour.
-        base: ``"bottom"`` puts the frame under the middle of the bounding box, ``"origin"`` leaves it.
-        decomposition: ``"auto"``, ``"coacd"`` or ``"convex"``; see :func:`convex_parts`.
-        concavity: CoACD's threshold, 0.01 (many parts) to 1 (one).
-    """
-
-    file: str
-    name: str = ""
-    display_name: str = ""
-    plural: str = ""
-    scale: float = 1.0
-    density: float | None = None
-    mass: float | None = None
-    welded: bool | None = None
-    up: Axis = "z"
-    color: Color | None = None
-    base: Base = "bottom"
-    decomposition: Method = "auto"
-    concavity: float = 0.05
+    file: str  # relative to the folder
+    name: str = ""  # identifier; by default the stem of the file
+    display_name: str = ""  # in prompts; by default the identifier with spaces
+    plural: str = ""  # of the display name; the regular one by default
+    scale: float = 1.0  # factor on all lengths; a file in millimetres needs 0.001
+    density: float | None = None  # kg/m^3, of the evenly filled shape
+    mass: float | None = None  # kg
+    welded: bool | None = None  # to the world; the file decides by default
+    up: Axis = "z"  # axis of the file that points up
+    color: Color | None = None  # class colour (r, g, b), also for surfaces without one
+    base: Base = "bottom"  # "bottom": frame under the middle of the bounding box; "origin": as in the file
+    decomposition: Method = "auto"  # see convex_parts
+    concavity: float = 0.05  # CoACD's threshold, 0.01 (many parts) to 1 (one)
 
 
 def read_entries(path: Path) -> list[AssetEntry]:
-    """The entries of a YAML file: a list of mappings, one per asset.
-
-    Raises:
-        CorruptFileError: not YAML; the line is named.
-        InvalidInputError: an unknown key (the nearest known one is offered), a value that cannot be, a file
-            that does not exist, or a name that appears twice.
+    """The entries of a YAML file: a list of mappings, one per asset. Raises CorruptFileError, with the line, for a file
+    that is not YAML, and InvalidInputError for a wrong key or value, a missing file or a repeated name.
     """
     import yaml
 
@@ -223,11 +203,9 @@ class Weight(NamedTuple):
 def weigh(
     given: Inertial | None, parts: Sequence[ConvexPart], volume: float, mass: float | None, density: float | None
 ) -> Weight:
-    """Mass properties of an asset.
-
-    The properties ``given`` by the file are kept when they can belong to a body of these fine parts and this ``volume``
-    (m^3). A user's ``mass`` (kg) keeps the file's distribution of mass; a user's ``density`` (kg/m^3) fills the shape
-    evenly.
+    """Mass properties of an asset of these fine parts and this ``volume`` (m^3). Those ``given`` by the file are kept
+    where they are possible. A user's ``mass`` (kg) keeps the file's distribution; a user's ``density`` (kg/m^3) fills
+    the shape evenly.
     """
     if density is not None:
         return Weight(mass_properties(parts, density * volume), (), ())
@@ -338,12 +316,9 @@ class ImportReport:
 
 
 def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
-    """The asset that ``entry`` makes of the file at ``path``, and its import report.
-
-    Raises:
-        InvalidInputError: a mesh that does not exist, or a model without volume.
-        CorruptFileError: a file cannot be read; file and reason are named.
-        MissingDependencyError: a format or method needs a package that is not installed.
+    """The asset that ``entry`` makes of the file at ``path``, and its import report. Raises InvalidInputError for a
+    missing mesh or a model without volume, CorruptFileError, and MissingDependencyError for a format or method without
+    its package.
     """
     model = _scaled(_read(path), entry)
     notes, warnings = list(model.notes), []

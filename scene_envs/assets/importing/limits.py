@@ -53,26 +53,16 @@ class ImportLimits:
     """Limits for each file of a user's assets.
 
     The environment variables ``SCENE_ENVS_IMPORT_MEGABYTES``, ``SCENE_ENVS_IMPORT_TRIANGLES`` and
-    ``SCENE_ENVS_IMPORT_SECONDS`` replace the defaults. The folder cannot set them, because its source may be
-    untrusted.
-
-    Attributes:
-        megabytes: Size of a file, 10⁶ bytes.
-        triangles: Number of triangles (or corners) of a mesh file, from its header or its content.
-        seconds: Time for reading, decomposing and weighing one asset; a longer import is abandoned.
+    ``SCENE_ENVS_IMPORT_SECONDS`` replace the defaults. The folder cannot set them, because its source may be untrusted.
     """
 
-    megabytes: float = 256.0
-    triangles: float = 1e6
-    seconds: float = 300.0
+    megabytes: float = 256.0  # size of a file, 10⁶ bytes
+    triangles: float = 1e6  # of a mesh file (or corners), from its header or content
+    seconds: float = 300.0  # for reading, decomposing and weighing one asset
 
     @classmethod
     def current(cls) -> ImportLimits:
-        """The limits, with the values of the environment variables that are set.
-
-        Raises:
-            InvalidInputError: a variable is not a positive number.
-        """
+        """The limits, with the environment variables that are set; InvalidInputError for one that is not positive."""
         chosen = {}
         for field in fields(cls):
             text = os.environ.get(_PREFIX + field.name.upper())
@@ -88,11 +78,8 @@ class ImportLimits:
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file that is larger, or whose header states more triangles, than the limits.
-
-    Raises:
-        InvalidInputError: the file exceeds a limit; the message names the file, the limit and its variable.
-        LargeImportError: the running import must move to a process of its own.
+    """Refuse a file that is larger, or whose header states more triangles, than the limits, by InvalidInputError; raise
+    LargeImportError where the running import must move to a process of its own.
     """
     limits = ImportLimits.current()
     try:
@@ -125,7 +112,6 @@ def check_triangles(path: Path, count: int) -> None:
 @contextmanager
 def timed(path: Path, room: float = math.inf) -> Iterator[None]:
     """Context in which the time of the import of the asset at ``path`` runs; see :func:`seconds_left`.
-
     :func:`check_file` raises LargeImportError for files of more than ``room`` bytes together.
     """
     seconds = ImportLimits.current().seconds
@@ -137,11 +123,7 @@ def timed(path: Path, room: float = math.inf) -> Iterator[None]:
 
 
 def seconds_left() -> float | None:
-    """Seconds until the running import has to be done; None when no import runs.
-
-    Raises:
-        InvalidInputError: the time is over.
-    """
+    """Seconds until the running import has to be done, None when none runs; InvalidInputError when the time is over."""
     clock = _clock.get()
     if clock is None:
         return None
@@ -152,12 +134,10 @@ def seconds_left() -> float | None:
 
 
 def in_time(work: Callable[[], Result]) -> Result:
-    """The result of ``work``, if it is done before the time limit of the running import.
+    """The result of ``work``. Raises its exceptions, and InvalidInputError when the running import is out of time.
 
-    Work that takes longer goes on in a thread of its own, which ends at the next :func:`seconds_left`. Work that
-    checks the time itself, such as that of CoACD, gets one more second, in which it can report the slow step.
-
-    Raises InvalidInputError when the time is over, and the exceptions of ``work``.
+    Work that takes longer goes on in a thread of its own, which ends at the next :func:`seconds_left`. Work that checks
+    the time itself, such as CoACD's, gets one more second, in which it can report the slow step.
     """
     outcome: Future[Result] = Future()
     context = copy_context()

@@ -48,10 +48,8 @@ _PREFIXED = re.compile(rb"(</?)([A-Za-z_][\w.-]*):([A-Za-z_][\w.-]*)")
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """One piece of geometry of a model.
-
-    The ``size`` (m) is (x, y, z) of a box, (radius, length along z without the caps) of a cylinder or capsule,
-    (radius,) of a sphere, (x, y, z radii) of an ellipsoid; of a mesh, it is the scale (x, y, z).
+    """One piece of geometry; ``size`` (m) is (x, y, z) of a box, (radius, length along z without the caps) of a
+    cylinder or capsule, (radius,) of a sphere, (x, y, z radii) of an ellipsoid, and the scale (x, y, z) of a mesh.
     """
 
     kind: Kind
@@ -117,13 +115,10 @@ def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
 def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     """The triangle meshes of a file, z up, in the unit of the file.
 
-    Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned. A COLLADA file
-    names its up axis and its unit, and both are applied.
-
-    Raises:
-        InvalidInputError: no such file, a format that cannot be read, or a file beyond the limits of imports.
-        CorruptFileError: the file cannot be read, holds no triangles, or a coordinate that is not finite.
-        MissingDependencyError: COLLADA without pycollada.
+    Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned; the up axis and
+    the unit that a COLLADA file names are applied. Raises InvalidInputError (no such file, unknown format, beyond the
+    limits), CorruptFileError (unreadable, no triangles, not finite) and MissingDependencyError (COLLADA without
+    pycollada).
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -338,9 +333,8 @@ def _corner_normals(mesh: trimesh.Trimesh) -> Array:
 
 
 def read_xml(path: Path) -> Element:
-    """The root element of an XML file; prefixes that are never declared are tolerated.
-
-    Raises CorruptFileError, with the line, for a file that cannot be read or is no XML, and as :func:`check_file` does.
+    """The root element of an XML file; prefixes that are never declared are tolerated. Raises CorruptFileError, with
+    the line, for a file that cannot be read or is no XML, and as :func:`check_file` does.
     """
     check_file(path)
     try:
@@ -394,12 +388,8 @@ def color_of(text: str | None, path: Path, where: str) -> Color | None:
 
 
 def find_mesh(uri: str, path: Path, where: str) -> Path:
-    """The file that ``uri`` names in the model at ``path``: relative, absolute, file://, package:// or model://.
-
-    A package is searched among the folders above the model, and in ``ROS_PACKAGE_PATH``.
-
-    Raises:
-        InvalidInputError: there is no such file; the places that were searched are named.
+    """The file that ``uri`` names in the model at ``path``: relative, absolute, file://, package:// or model://. A
+    package is searched above the model and in ``ROS_PACKAGE_PATH``; InvalidInputError names the places searched.
     """
     text = uri.strip()
     scheme, separator, rest = text.partition("://")

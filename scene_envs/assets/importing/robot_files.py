@@ -30,10 +30,8 @@ _ZERO = (0.0, 0.0, 0.0)
 
 
 def read_sdf(path: Path) -> Model:
-    """The model in an SDF file, in the model frame; the pose of the model in its world is ignored.
-
-    Raises CorruptFileError for a file that is no SDF or contradicts itself, and InvalidInputError for several models,
-    an include, or a mesh that does not exist.
+    """The model in an SDF file, in the model frame; the model's pose in its world is ignored. Raises CorruptFileError
+    for a file that is no SDF or contradicts itself, InvalidInputError for several models, an include or a missing mesh.
     """
     model = _only_model(path)
     links = {link.get("name", ""): link for link in model.findall("link")}
@@ -176,9 +174,7 @@ def _flag(text: str | None) -> bool:
 
 def read_urdf(path: Path) -> Model:
     """The model in a URDF file, in the frame of its root link; movable joints are frozen at zero and listed in a note.
-
-    Raises CorruptFileError for a file that is no URDF or contradicts itself, and InvalidInputError for a mesh that does
-    not exist.
+    Raises CorruptFileError for a file that is no URDF or contradicts itself, InvalidInputError for a missing mesh.
     """
     robot = read_xml(path)
     if robot.tag != "robot":

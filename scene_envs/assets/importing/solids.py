@@ -52,11 +52,8 @@ _CAP = np.radians(15.0)
 def few_cornered_hull(points: Array, tolerance: float, corners: int = MAX_CORNERS) -> tuple[ConvexPart, float]:
     """A hull of some of the points (P, 3), and the farthest distance (m) of a point outside it.
 
-    Starts from the extreme points and adds the farthest outlier until all are within ``tolerance`` (m) or
-    ``corners`` are used, as quickhull does.
-
-    Raises:
-        InvalidInputError: the points lie in one plane.
+    Starts from the extreme points and adds the farthest outlier until all are within ``tolerance`` (m) or ``corners``
+    are used, as quickhull does. Raises InvalidInputError for points in one plane.
 
     >>> turns = np.linspace(0.0, 2.0 * np.pi, 1000, endpoint=False)
     >>> disc = np.array([[np.cos(t), np.sin(t), z] for t in turns for z in (0.0, 0.1)])
@@ -134,13 +131,10 @@ def convex_parts(
 ) -> tuple[list[ConvexPart], list[str], list[str]]:
     """The convex parts of one mesh (m), with notes and warnings; no parts when the mesh spans no volume.
 
-    Closed bodies are taken one by one: convex ones, whose depth below their hull is at most ``tolerance`` (m), keep
-    their shape, concave ones are decomposed. A surface that is not closed is decomposed as a whole. ``threshold`` is
-    CoACD's concavity, relative to the size of the body; ``what`` names the mesh in messages.
-
-    Args:
-        method: ``"convex"`` takes one hull of the whole mesh; ``"coacd"`` requires CoACD where a body is concave, or
-            raises MissingDependencyError; ``"auto"`` falls back to a hull where CoACD is not installed.
+    Closed bodies are taken one by one: those whose depth below their hull is at most ``tolerance`` (m) keep their
+    shape, concave ones are decomposed. A surface that is not closed is decomposed as a whole. ``threshold`` is CoACD's
+    concavity, relative to the size of the body. ``"convex"`` takes one hull of the whole mesh; ``"coacd"`` raises
+    MissingDependencyError where a concave body needs CoACD, and ``"auto"`` then takes a hull.
     """
     surface = bare(mesh)
     if not len(surface.faces) or not has_volume(np.asarray(surface.vertices)):
@@ -237,8 +231,7 @@ def _has_coacd() -> bool:
 
 def run_coacd(vertices: Array, faces: Array, settings: dict[str, Any], what: str) -> list[Array]:
     """Corners (P, 3) of the convex pieces of a mesh (V, 3), (F, 3), from a process that ends with the import's time.
-
-    Raises InvalidInputError when CoACD takes too long, or fails on the mesh called ``what``.
+    Raises InvalidInputError when CoACD takes too long or fails.
     """
     try:
         return run_apart(f"{__name__}:coacd_pieces", (vertices, faces, settings), seconds_left())  # type: ignore[no-any-return]
@@ -327,10 +320,7 @@ def _file(path: Path, changed: int) -> tuple[trimesh.Trimesh, ...]:
 
 
 def meshes_of(shape: Shape) -> list[trimesh.Trimesh]:
-    """The meshes of a mesh shape in the model frame, colours kept.
-
-    Raises like :func:`read_mesh`.
-    """
+    """The meshes of a mesh shape in the model frame, colours kept; raises like :func:`read_mesh`."""
     assert shape.path is not None
     changed = shape.path.stat().st_mtime_ns if shape.path.is_file() else 0
     meshes: list[Any] = [mesh.copy() for mesh in _file(shape.path, changed)]
@@ -368,10 +358,8 @@ def visual_of(shape: Shape, color: Color | None) -> list[trimesh.Trimesh]:
 
 
 def collision_of(shape: Shape, method: Method, tolerance: float, threshold: float) -> Collision:
-    """Convex parts of a shape.
-
-    Balls are polyhedra with flat faces at their poles. Cylinders are prisms of 16 sides whose corners lie on the
-    circle. For meshes see :func:`convex_parts`.
+    """Convex parts of a shape. Balls are polyhedra with flat faces at their poles, cylinders are prisms of 16 sides
+    whose corners lie on the circle; for meshes see :func:`convex_parts`.
     """
     if shape.kind != "mesh":
         part = _primitive(shape)

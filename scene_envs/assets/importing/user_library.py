@@ -104,11 +104,8 @@ class FolderIndex:
 
 
 def folder_index(folder: str | os.PathLike[str]) -> FolderIndex:
-    """Index of a folder, without reading its models.
-
-    Raises:
-        InvalidInputError: no such folder, no assets in it, or a wrong entry.
-        CorruptFileError: ``library.yaml`` cannot be read.
+    """Index of a folder, without reading its models. Raises InvalidInputError for no such folder, no assets or a wrong
+    entry, and CorruptFileError for an unreadable ``library.yaml``.
     """
     root = Path(folder).expanduser().resolve()
     if not root.is_dir():

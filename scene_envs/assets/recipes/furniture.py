@@ -124,10 +124,9 @@ def floor() -> Model:
 
 @asset_recipe("shelf", display_name="shelf", plural="shelves", mass=0.0, color=(160, 128, 72))
 def shelf() -> Model:
-    """Four boards between two sides; the origin is in the middle, the open side faces +x.
-
-    Below the top board there are 0.295 m (x from -0.145 to 0.15) by 0.568 m (y) of clear space, and 0.2523, 0.2464
-    and 0.2523 m of clear height from the lowest tier up. The top board is 0.30 by 0.60 m and open on all sides.
+    """Four boards between two sides; the origin is in the middle, the open side faces +x. The top board, 0.30 by 0.60
+    m, is open on all sides. Below it there are 0.295 m (x from -0.145 to 0.15) by 0.568 m (y) of clear space, 0.2523,
+    0.2464 and 0.2523 m high from the lowest tier up.
     """
     bottom, top = TIERS[0] - BOARD, TIERS[-1] - BOARD
     inner = _WIDTH - 2.0 * BOARD

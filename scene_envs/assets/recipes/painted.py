@@ -33,11 +33,9 @@ def revolve(
     segments: int = 32,
     swell: Callable[[Array, Array], Array] | None = None,
 ) -> trimesh.Trimesh:
-    """Revolve a smooth half section (P, 2), points (r, z) m, about z and paint it cell by cell.
-
-    The outside is on the right of the profile, as for :func:`~scene_envs.assets.shapes.lathe`. ``paint`` chooses from
-    ``colors`` by angle and height of the middle of a cell. ``swell`` is a factor on the radius by angle (rad) and
-    height (m), for lobes and spouts.
+    """Revolve a smooth half section (P, 2), points (r, z) m, outside on its right, about z and paint it cell by cell.
+    ``paint`` chooses from ``colors`` by angle and height of a cell's middle; ``swell`` is a factor on the radius by
+    angle (rad) and height (m), for lobes and spouts.
     """
     section = np.asarray(profile, dtype=np.float64)
     angles = 2.0 * np.pi * np.arange(segments) / segments
@@ -54,9 +52,8 @@ def revolve(
 
 
 def sleeve(radius: float, levels: ArrayLike, colors: Sequence[Color]) -> trimesh.Trimesh:
-    """The wall of a cylinder of ``radius`` m in K - 1 coloured bands whose edges may wave.
-
-    ``levels`` (K, segments) are the heights (m) of the edges of the bands, bottom first, one per angle.
+    """The wall of a cylinder of ``radius`` m in K - 1 coloured bands whose edges may wave. ``levels`` (K, segments) are
+    the heights (m) of the edges of the bands, bottom first, one per angle.
     """
     heights = np.asarray(levels, dtype=np.float64)
     unit = circle(heights.shape[1])
@@ -68,9 +65,8 @@ def sleeve(radius: float, levels: ArrayLike, colors: Sequence[Color]) -> trimesh
 
 
 def loft(loops: ArrayLike, colors: Sequence[Color]) -> trimesh.Trimesh:
-    """A closed body between convex outlines (K, P, 3) m, all counter-clockwise seen from above, bottom first.
-
-    The first and the last outline are flat and filled in. Colours: the underside, K - 1 walls, the top.
+    """A closed body between convex outlines (K, P, 3) m, counter-clockwise seen from above, bottom first; the first and
+    the last are flat and filled in. Colours: the underside, K - 1 walls, the top.
     """
     outlines = np.asarray(loops, dtype=np.float64)
     skins = []

@@ -241,8 +241,7 @@ def _count(claim: Claim, number: int, scene: SceneFacts, members: NDArray[np.int
 
 
 def holders(scene: SceneFacts, inside: bool) -> NDArray[np.int64]:
-    """(n,) index of the container that each object lies in if ``inside``, else of its support; -1 for none.
-
-    An object in a container stands on nothing.
+    """(n,) index of the container that each object lies in if ``inside``, else of its support; -1 for none. An object
+    in a container stands on nothing.
     """
     return scene.held.inside if inside else np.where(scene.held.contained, -1, scene.held.support)

@@ -45,9 +45,8 @@ class ReferringExpressions:
         return self.views[0]
 
     def references(self, index: int) -> list[Reference]:
-        """The simplest expressions for one object; empty when there are none.
-
-        These are its name alone, or its name and place, or its rank counted from the sides where the rank is low.
+        """The simplest expressions for one object; empty when there are none. These are its name alone, or its name and
+        place, or its rank counted from the sides where the rank is low.
         """
         if index not in self._known:
             self._known[index] = self._references(index)
@@ -246,10 +245,7 @@ class _Writer:
 
     @cached_property
     def _stays(self) -> Counter[tuple[str, int, int]]:
-        """Number of objects by (name, place, tier).
-
-        Only places that have tiers or stand on another place count; the floor is no place.
-        """
+        """Number of objects by (name, place, tier), for places with tiers or on another place; the floor is none."""
         held, scene = self.scene.held, self.scene
         named = (held.place[held.place] >= 0) | (scene.tiers[held.place] > 0)
         there = np.flatnonzero((held.place >= 0) & named & ~scene.fixed)
