@@ -49,8 +49,10 @@ def run_demo(
 ) -> dict[str, Any]:
     """Post-train a prior with the keys of each of ``runs`` at the same time, measure all priors on ``scenes`` samples
     from the same noise, and write report.html, metrics.json, pictures and a folder per run, which ``prior=`` loads, to
-    ``output``. Returns the numbers of metrics.json; a TrainingError, with the cause on stderr, if a run failed. A
-    second call resumes the runs."""
+    ``output``. Both runs together have ``workers`` physics workers. Returns the numbers of metrics.json: those of
+    ``measure_prior`` for ``base`` and each run, the metrics of ``runs``, and ``seconds``. A TrainingError, with the
+    cause on stderr, if a run failed; a second call resumes the runs.
+    """
     from scene_envs.physics import make_pool
 
     directory, started = Path(output), time.perf_counter()
@@ -99,7 +101,8 @@ class _Finished:
 @contextmanager
 def _post_training(commands: Mapping[str, Sequence[str]]) -> Iterator[dict[str, subprocess.Popen[str]]]:
     """Context in which ``scene-envs post-train`` runs with each list of keys, and with an equal part of the cores. Runs
-    that are not finished at the end of the context save and end."""
+    that are not finished at the end of the context save and end.
+    """
     threads = str(max(1, len(os.sched_getaffinity(0)) // len(commands)))
     paths = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
     environment = {"PYTHONPATH": paths, "PYTHONSAFEPATH": "1", "OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}

@@ -33,7 +33,7 @@ class StepRow:
 
     step: int  # index in the step table
     timestep: int  # at which the step starts
-    std: float  # smallest over random entries, normalised units
+    std: float  # smallest standard deviation over random entries, normalised units
     weight: float  # in the policy gradient; 0 leaves the step out
     gradient_norm: float  # of this step's policy gradient alone; 0 if the step is left out
 
@@ -74,7 +74,8 @@ class DoctorReport:
 
 def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> DoctorReport:
     """Examine a configuration with one batch of scenes; nothing is trained or written. ``prior`` replaces the one that
-    ``config.prior`` names."""
+    ``config.prior`` names.
+    """
     with TemporaryDirectory() as scratch:
         real = config.regularisation
         bank = min(real.bank_size, config.guard.scenes + 4 * real.batch_size)

@@ -249,7 +249,8 @@ class SampleCheck:
     def figures(self, batch: SceneBatch) -> dict[str, float]:
         """Mean reward, and differences from the real scenes: distances of object counts and of tallest stacks
         (objects), KL divergence of categories (nats), and accuracy of a classifier (share of scenes). A figure that has
-        no meaning, such as the categories of empty scenes, is NaN. Assets without geometry have no stacks."""
+        no meaning, such as the categories of empty scenes, is NaN. Assets without geometry have no stacks.
+        """
         from agents.evaluation.classifier import classifier_accuracy
         from agents.evaluation.layouts import category_kl, count_wasserstein, stack_wasserstein
 

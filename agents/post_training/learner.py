@@ -51,7 +51,8 @@ class Learner:
     """Samples scenes under the current policy and updates it. All randomness depends on (seed, purpose, iteration).
     ``reward`` is resolved by :func:`rewards.process.run_reward`; ``batch_size`` counts the scenes of all processes;
     ``slots`` None takes as many as the prior was trained on; ``prompt`` is that of a
-    :class:`~agents.post_training.rollouts.PromptDeck`; ``workers`` may be ``"ray"``."""
+    :class:`~agents.post_training.rollouts.PromptDeck`; ``workers`` may be ``"ray"``.
+    """
 
     def __init__(
         self,
@@ -125,7 +126,8 @@ class Learner:
     def begin_rewards(self, real: SceneBatch, *, first: bool) -> None:
         """Give real scenes to the parts of the reward that learn (:class:`rewards.LearnedReward`), the same parts in
         all processes. ``first`` also trains them on samples of the base prior; it is False if the run's state is
-        restored."""
+        restored.
+        """
         seed = stream_seed(self.seed, "discriminator")
         for part in self.learned:
             part.begin(real, seed)
@@ -165,7 +167,8 @@ class Learner:
     def accumulate(self, batch: TensorDictBase, scenes: SceneBank, index: int) -> dict[str, float]:
         """Put the policy and regularisation gradients, summed over all processes, into ``.grad``; measure each one.
         ``batch`` has whole episodes [B, S] with advantages; the draws of steps and real scenes follow from ``index``,
-        the number of the update."""
+        the number of the update.
+        """
         self.optimizer.zero_grad(set_to_none=True)
         policy = self.algorithm.accumulate(batch, self._generator("steps", index))
         self.processes.sum_gradients(self.parameters)
@@ -226,7 +229,8 @@ class Learner:
 
 class WholeBatchReward:
     """A resolved reward that depends on the other scenes of a batch: each of ``processes``, which call it together with
-    equally many scenes, scores the scenes of all."""
+    equally many scenes, scores the scenes of all.
+    """
 
     depends_on_batch = True
 

@@ -58,7 +58,8 @@ class SceneBank:
 
     def batch(self, count: int, generator: Generator) -> PromptedScenes:
         """``count`` training scenes, drawn with replacement, each with one of its prompts. As in pretraining, the
-        prompt is withheld (``""``) from one scene in ten."""
+        prompt is withheld (``""``) from one scene in ten.
+        """
         index = torch.randint(len(self.train), (count,), generator=generator)
         texts = None
         if self.prompts is not None:
@@ -74,7 +75,8 @@ class SceneBank:
     ) -> list[str] | None:
         """One prompt of each held-out scene, or of the first ``count``; kinds of prompts alternate. None without
         prompts. ``""`` replaces a prompt for more than ``slots`` objects of ``scene_type``; ``slots`` None allows any
-        number."""
+        number.
+        """
         if self.prompts is None:
             return None
         first, count = len(self.train), len(self.heldout) if count is None else count
@@ -95,7 +97,8 @@ def kept_scenes(
     progress: str = "none",
 ) -> SceneBatch:
     """The real scenes of a run, kept in its folder with the prompts of a dataset; the first process draws them.
-    ``reuse`` loads those that are already in the folder, as a resumed run does."""
+    ``reuse`` loads those that are already in the folder, as a resumed run does.
+    """
     path, texts, processes = directory / SCENES_NAME, directory / PROMPTS_NAME, ProcessGroup.current()
     if processes.is_first and not (reuse and path.exists()):
         count = settings.bank_size
@@ -114,7 +117,8 @@ def real_scenes(
     """``count`` scenes of the prior's type from ``"grammar"`` or a dataset folder (all it has, if fewer), and the
     prompts of each if they have any. ``seed`` is that of the grammar, or of the choice of rows. ``slots`` is the
     smallest number per scene (None: as in training); scenes keep all their slots, because a prior reads any number of
-    slots."""
+    slots.
+    """
     slots = max(prior.scene_type.slots, prior.config.slots if slots is None else slots)
     if source == "grammar":
         from scene_envs.grammars import get_grammar
@@ -149,7 +153,8 @@ def kept_base_samples(
     progress: str = "none",
 ) -> PromptedScenes:
     """The base prior's samples of a run, kept in its folder; the first process draws them, or ``reuse`` loads them.
-    They have the prompts of real scenes, so that prompts do not distinguish samples from real scenes."""
+    They have the prompts of real scenes, so that prompts do not distinguish samples from real scenes.
+    """
     path, processes = directory / BASE_SAMPLES_NAME, ProcessGroup.current()
     prompts = bank.batch(count, Generator().manual_seed(stream_seed(seed, "base_prompts"))).prompts
     if processes.is_first and not (reuse and path.exists()):

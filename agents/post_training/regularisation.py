@@ -45,7 +45,8 @@ SceneLoss = Callable[[NoisedScenes, Text | None], Tensor]
 
 class Regularisation:
     """The loss that keeps a prior in training near real scenes, and its weight; the base ``prior`` is copied if
-    needed."""
+    needed.
+    """
 
     def __init__(self, settings: RegularisationSettings, prior: ScenePrior) -> None:
         self.settings = settings
@@ -69,7 +70,8 @@ class Regularisation:
     ) -> dict[str, float]:
         """Add the gradient of the loss on ``real`` scenes of all processes, and on equally many ``base`` samples
         (discriminative loss only); returns columns of the log. Both get the same timesteps and noise from ``generator``
-        (CPU). ``chunk`` is the number of scenes per pass."""
+        (CPU). ``chunk`` is the number of scenes per pass.
+        """
 
         def add(scenes: PromptedScenes, generator: Generator, loss: SceneLoss | None) -> tuple[float, float]:
             return add_regularisation_gradient(
@@ -103,7 +105,8 @@ class Regularisation:
 
     def return_to_checkpoint(self, ratio: float) -> None:
         """Keep the weight, and forget how the held-out loss changed before a return to a checkpoint, whose held-out
-        loss is ``ratio`` times the base prior's."""
+        loss is ``ratio`` times the base prior's.
+        """
         self.state = self.state.returned(ratio)
 
     def verdict(self) -> str:
@@ -159,7 +162,8 @@ def add_regularisation_gradient(
     """Add ``coefficient`` times the gradient of the mean (B,) ``loss`` of noised scenes (None: pretraining loss) to
     ``.grad``. ``x0`` (B, N, D) are normalised scenes of all processes, of which each takes its share; ``generator`` is
     on the CPU; a scene without a prompt has ``""``. Returns the mean loss of all scenes, and the norm of the scaled
-    gradient."""
+    gradient.
+    """
     if coefficient == 0:
         return 0.0, 0.0
     processes, parameters = ProcessGroup.current(), [p for p in prior.parameters() if p.requires_grad]
@@ -190,10 +194,12 @@ def add_regularisation_gradient(
 @dataclass(frozen=True)
 class DiscriminativeLoss:
     """Direct discriminative optimisation (Zheng et al. 2025, arXiv 2503.01103) of a diffusion prior. The log-likelihood
-    ratio of prior and base is the logit of a discriminator of real scenes and base samples; its optimum is the density
-    of real scenes. The pretraining loss l of a noised scene takes the place of -log p. With d = l(base) - l(prior), the
-    losses are (2 / s) softplus(-s d) of real scenes and (2 / s) softplus(s d) of base samples. At the base prior, their
-    gradients are those of l and of -l. They vanish where s d, or -s d, is large, so no sample repels without bound.
+    ratio of prior and base is the logit of a discriminator of real scenes and base samples; at its best, the prior has
+    the density of real scenes. The pretraining loss l of a noised scene takes the place of -log p. With d = l(base) -
+    l(prior), the losses are (2 / s) softplus(-s d) of real scenes and (2 / s) softplus(s d) of base samples. At the
+    base prior, their gradients are those of l and of -l, which cancel in the mean where base samples are like real
+    scenes. The gradient of a real scene vanishes where s d is large, that of a base sample where -s d is, so no sample
+    repels without bound.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed")
@@ -252,8 +258,8 @@ class HoldState:
 def adjust(state: HoldState, target: float, measured: float, iteration: int) -> HoldState:
     """The state after the held-out loss was ``measured`` as a ratio to the base prior's, of which ``target`` is held:
     integral control of the factor's logarithm, within bounds (Ziegler et al. 2019, Eq. 4). Unlike there, the gain is
-    per iteration, so that checks may come at any distance, and the ratio is extrapolated by ``LOOK_AHEAD`` iterations.
-    The error is bounded; one that is not a number counts as the largest.
+    per iteration, so that checks may come at any distance, and the ratio is extrapolated by ``LOOK_AHEAD`` iterations
+    with its averaged change. The error is bounded; one that is not a number counts as the largest.
 
     >>> state = adjust(HoldState(), 1.05, measured=1.1, iteration=1)
     >>> round(state.factor, 3)

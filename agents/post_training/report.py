@@ -133,7 +133,8 @@ def post_train_and_compare(
 
 def load_learned_rewards(reward: Any, directory: Path, heldout: int, seed: int) -> None:
     """Give the parts of a resolved ``reward`` that learn their state at the end of the run in ``directory``, whose
-    guard held out ``heldout`` real scenes."""
+    guard held out ``heldout`` real scenes.
+    """
     if parts := learned_parts(reward):
         real = SceneBatch.load(directory / SCENES_NAME)
         state = load_checkpoint(directory / CHECKPOINT_NAME)["learner"]["learned_rewards"]
@@ -175,11 +176,11 @@ def _write_comparison(
 
 @dataclass(frozen=True)
 class Measured:
-    """Fresh samples of a prior and their figures, with standard errors ``*_sem``. ``ready_*`` figures count free
-    objects after projection and settling that are feasible and in the workspace, ``feasible_*`` the raw free ones, and
-    ``objects`` all, welded included. ``reward`` is the trained one, ``reward_invalid`` counts scenes that it could not
-    score, and ``prompt_match`` is the reward of that name. Figures of physics leave out ``invalid_scenes``, where it
-    failed."""
+    """Fresh samples of a prior and their figures. ``objects`` are all, welded included; ``feasible_*`` figures count
+    raw free objects, and ``ready_*`` free objects that are feasible and in the workspace after projection and settling.
+    Both leave out ``invalid_scenes``, where physics failed. ``reward`` is the trained one, ``reward_invalid`` counts
+    scenes that it could not score, ``prompt_match`` is the reward of that name, and ``*_sem`` are standard errors.
+    """
 
     figures: dict[str, float]
     raw: SceneBatch  # raw samples
@@ -202,7 +203,8 @@ def measure_prior(
 ) -> Measured:
     """Sample ``count`` scenes of ``num_steps`` denoiser evaluations and measure all of them. The same ``seed`` for two
     priors starts both from the same noise. ``prompts`` has one per scene; ``slots`` None takes as many as the prior was
-    trained on; ``reward`` is that of the run, from :func:`rewards.process.run_reward`."""
+    trained on; ``reward`` is that of the run, from :func:`rewards.process.run_reward`.
+    """
     from scene_envs.physics import feasibility, make_ready
 
     raw = prior.sample(
@@ -255,14 +257,16 @@ def _standard_error(values: Tensor) -> float:
 
 def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) -> Path:
     """Draw the first scenes of ``batch`` with their counts as a PNG; with ``is_ready`` (B, N), captions count these
-    objects, and the other free objects are red."""
+    objects, and the other free objects are red.
+    """
     images, captions = _drawn(batch, is_ready, _GALLERY)
     return _save_gallery(images, captions, path)
 
 
 def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bool = False) -> Path:
     """Draw the first scenes of up to three priors, by caption and from the same noise, as a PNG: a row per scene, a
-    column per prior. ``ready`` shows them after projection and settling, with objects that are not ready in red."""
+    column per prior. ``ready`` shows them after projection and settling, with objects that are not ready in red.
+    """
     drawn = [
         _drawn(part.ready if ready else part.raw, part.is_ready if ready else None, _GALLERY // 2)
         for part in measured.values()

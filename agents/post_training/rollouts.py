@@ -252,7 +252,8 @@ class PromptDeck:
 
 def run_prompts(directory: Path, batch: SceneBatch, seed: int) -> PromptSets:
     """The prompts of a run's real scenes: those kept in the run's folder, or else descriptions of the scenes, written
-    on first use. Those of scene i depend only on ``seed`` and on i."""
+    on first use. Those of scene i depend only on ``seed`` and on i.
+    """
     path = directory / PROMPTS_NAME
     if path.exists():
         kept: list[list[str]] = json.loads(path.read_text(encoding="utf-8"))

@@ -56,7 +56,8 @@ def write_log(directory: Path, history: Sequence[Mapping[str, float]]) -> None:
 
 def load_resumable(directory: Path, config: Mapping[str, Any]) -> dict[str, Any] | None:
     """The checkpoint of an interrupted run of the same configuration, as plain values; None without one. A
-    CorruptFileError if it is truncated, an InvalidInputError if the directory holds a run of another configuration."""
+    CorruptFileError if it is truncated, an InvalidInputError if the directory holds a run of another configuration.
+    """
     path = directory / CHECKPOINT_NAME
     if not path.exists():
         return None
@@ -93,7 +94,8 @@ def draw_curve(
 ) -> Path:
     """Draw reward and guard over iterations as a PNG. ``history`` has ``iteration``, ``reward``, ``reward_std`` and, at
     checks, ``guard_ratio``, whose ``limit`` is a line; diamonds are rewards of the guard's samples. The picture is
-    shaded from iteration ``beyond`` (over-optimised); ``highest`` bounds the band of the standard deviation."""
+    shaded from iteration ``beyond`` (over-optimised); ``highest`` bounds the band of the standard deviation.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -146,7 +148,8 @@ def _smooth(values: np.ndarray, half: int = 4) -> np.ndarray:
 def run_progress(title: str, total: int, style: str, done: int = 0) -> Iterator[Callable[[int, float, float], None]]:
     """Show the progress of a run; yields the function that advances it, which takes the number of iterations done, the
     last batch's mean reward, and the held-out loss divided by the base prior's. ``style`` is ``"bar"`` (lines when
-    stderr is no terminal), ``"lines"`` (after the first iteration, every 5 s and at the end) or ``"none"``."""
+    stderr is no terminal), ``"lines"`` (after the first iteration, every 5 s and at the end) or ``"none"``.
+    """
     with Progress(title, total, done=done, style=style, every=5.0, always=(done + 1, total)) as progress:
 
         def update(iteration: int, reward: float, guard: float) -> None:

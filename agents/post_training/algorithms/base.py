@@ -26,7 +26,7 @@ from scene_envs.errors import InvalidInputError
 
 @dataclass(frozen=True)
 class BatchGradient:
-    """Loss and further columns of the log, of the gradient that a batch added to ``.grad``."""
+    """Statistics of the gradient that a batch added to ``.grad``: the loss, and further columns of the log."""
 
     loss: float  # over the scenes of all processes
     columns: Mapping[str, float] = field(default_factory=dict)
@@ -84,7 +84,8 @@ class Algorithm(ABC):
 class AveragedSampler(Algorithm):
     """An algorithm that samples with ``sampler``, a copy of ``prior`` whose weights are also evaluated and saved. After
     each batch it moves towards ``prior``; ``sampler_decay`` is the final decay per batch of this
-    :class:`~agents.utils.weight_average.WeightAverage`."""
+    :class:`~agents.utils.weight_average.WeightAverage`.
+    """
 
     def __init__(self, policy: DenoisingPolicy, *, sampler_decay: float, warm_up: float = 10.0) -> None:
         self.policy = policy
@@ -128,7 +129,8 @@ class AveragedSampler(Algorithm):
 
 class PlainLoss(LossModule):
     """A torchrl loss whose gradient goes to the modules' own parameters, and which has no value estimator. Its accepted
-    keys have ``text`` and ``text_mask``."""
+    keys have ``text`` and ``text_mask``.
+    """
 
     tensor_keys: Any
 
@@ -263,12 +265,12 @@ class Advantage(TensorDictModuleBase):
 
 
 class ForwardAdvantage(Advantage):
-    """Writes advantages of poses that are not clipped, and ``category_advantage`` (B, S, 1): that of the scene, or 0
-    for no credit. Also reads ``judged`` (B, S, N) bool, optional: slots that the reward does not judge have no
-    advantage, or a table of credit 0 would be repelled like an object that is not feasible. ``counts_objects`` (B, S,
-    1) bool, optional, is whether the reward depends on which objects there are. ``credit`` is for poses;
-    ``category_credit="auto"`` is ``"none"`` where poses have credit per object and the reward does not count
-    objects."""
+    """Writes advantages of poses that are not clipped, and ``category_advantage`` (B, S, 1): that of the scene, or
+    zeros for no credit. It also reads two optional keys. Slots outside ``judged`` (B, S, N) bool, which the reward does
+    not judge, have no advantage of their own: a table of credit 0 would otherwise be repelled like an object that is
+    not feasible. ``counts_objects`` (B, S, 1) bool says whether the reward depends on which objects there are; if not,
+    and if poses have credit per object, ``category_credit="auto"`` is ``"none"``, and otherwise ``"scene"``.
+    """
 
     out_keys = ["advantage", "category_advantage", "valid"]  # noqa: RUF012
 

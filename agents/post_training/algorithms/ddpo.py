@@ -236,9 +236,10 @@ def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[
 def accumulate_policy_gradient(
     loss: DDPOSFLoss, batch: TensorDictBase, steps: Sequence[int], *, scale: float = 1.0
 ) -> BatchGradient:
-    """Add ``scale`` times the policy gradient of whole episodes [B, S], summed over ``steps``, to ``.grad``. It goes by
-    chunks of scenes and single steps, so memory does not depend on the number of steps. With several processes,
-    ``.grad`` gets the part of this process's scenes in the mean over all scenes."""
+    """Add ``scale`` times the policy gradient of whole episodes [B, S], summed over ``steps``, to ``.grad``. It is
+    computed for one step, and for ``chunk`` scenes of the policy, at a time, so memory does not depend on the number of
+    steps. With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
+    """
     total, largest, clipped = 0.0, 0.0, 0.0
     valid = batch["valid"][:, -1, 0]
     size = loss.policy.chunk or len(valid)

@@ -277,9 +277,10 @@ class AWMLoss(ForwardProcessLoss):
 
 class Expectation(nn.Module):
     """Copy of the denoiser that learns, with AdamW, the mean target at a noised scene over the sampling policy's
-    scenes. A policy in training is no exact denoiser of its own samples, so its output is not this mean: where all
-    samples are bad, the difference repels the output, the sampling policy follows, and the difference grows. With the
-    mean, only the covariance of target and advantage is left, as in a policy gradient with an exact baseline.
+    scenes. A forward-process loss otherwise takes the output of the sampling policy as this mean, which it is not,
+    because a policy in training is no exact denoiser of its own samples. Where all samples are bad, the difference
+    repels the output, the sampling policy follows, and the difference grows. With the learned mean, only the covariance
+    of target and advantage is left, as in a policy gradient with an exact baseline.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed")
