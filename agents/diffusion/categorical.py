@@ -243,10 +243,10 @@ def fitted(rate: Tensor, like: Tensor) -> Tensor:
 
 
 def draw_unmasked(masked: Tensor, chance: Tensor, uniform: Tensor) -> Tensor:
-    """(B, N) bool: of the ``masked`` slots of each scene, those unmasked now, drawn without replacement with a scene's
-    ``chance`` (B, N). Of M masked slots with chance p, M p rounded down or up are unmasked, with mean M p. The ranks of
-    independent ``uniform`` numbers (B, N) on [0, 1) do not depend on their minimum, so the ranks choose the slots, and
-    the minimum decides the rounding.
+    """(B, N) bool: of the ``masked`` slots of each scene, those unmasked now, drawn without replacement. The masked
+    slots of a scene have the same ``chance`` (B, N). Of M masked slots with chance p, M p rounded down or up are
+    unmasked, with mean M p. The ranks of independent ``uniform`` numbers (B, N) on [0, 1) do not depend on their
+    minimum, so the ranks choose the slots, and the minimum decides the rounding.
 
     >>> masked = torch.tensor([[True, True, False, True, True]])
     >>> draw_unmasked(masked, torch.full((1, 5), 0.5), torch.tensor([[0.4, 0.9, 0.0, 0.2, 0.6]])).tolist()

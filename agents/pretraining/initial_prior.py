@@ -140,8 +140,8 @@ def _prepare_union(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Te
 def build_prior(
     config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]] = ()
 ) -> ScenePrior:
-    """The prior that ``config`` starts from: an older one, or a fresh one, fitted to ``raw`` scenes (M, N, D) with a
-    vocabulary, if it reads prompts, from the ``prompts`` of every scene.
+    """The prior that ``config`` starts from: an older one, or a fresh one, fitted to ``raw`` scenes (M, N, D). A fresh
+    prior that reads prompts has the vocabulary of the ``prompts`` of every scene.
     """
     if config.prior:
         return _started(config, raw, prompts)
