@@ -29,19 +29,14 @@ _TINY = 1e-30
 class CategoricalSchedule:
     """Cumulative rates of a kernel at t = 0..T.
 
-    Attributes:
-        name: one of :data:`CATEGORICAL_KERNELS`.
-        keep: (T + 1,) float64, probability that a category has not been touched; 1 at t = 0.
-        mask: (T + 1,) float64, probability that it is the mask token; 0 at t = 0.
-
     >>> schedule = make_categorical_schedule("absorbing", 10)
     >>> round(float(schedule.keep[5]), 3), round(float(schedule.mask[5]), 3)
     (0.5, 0.5)
     """
 
-    name: str
-    keep: Tensor
-    mask: Tensor
+    name: str  # one of :data:`CATEGORICAL_KERNELS`
+    keep: Tensor  # (T + 1,) float64, probability that a category has not been touched; 1 at t = 0
+    mask: Tensor  # (T + 1,) float64, probability that it is the mask token; 0 at t = 0
 
     @property
     def num_timesteps(self) -> int:
@@ -79,10 +74,9 @@ def _early_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
 
 
 def _squared_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """The kernel ``early_absorbing`` with a quadratic schedule, which unmasks the last categories one at a time.
-
-    Categories that are unmasked in the same step are drawn independently, which makes counts inexact. Few categories
-    should therefore be left for the last of these steps, as with the cosine of MaskGIT (Chang et al. 2022).
+    """The kernel ``early_absorbing`` with a quadratic schedule, which unmasks the last categories one at a time, as the
+    cosine of MaskGIT does (Chang et al. 2022): categories of the same step are drawn independently, which makes counts
+    inexact.
     """
     u = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
     mask = torch.maximum(1e-5 * u, ((u - 0.5) / 0.5).clamp(min=0.0) ** 2)
@@ -249,12 +243,10 @@ def fitted(rate: Tensor, like: Tensor) -> Tensor:
 
 
 def draw_unmasked(masked: Tensor, chance: Tensor, uniform: Tensor) -> Tensor:
-    """(B, N) bool: of the ``masked`` slots of each scene, those that are unmasked now, drawn without replacement.
-
-    Every masked slot of a scene has the same ``chance`` (B, N). Of M masked slots with chance p, M p rounded down or up
-    are unmasked, up with the probability that makes M p the mean. The ranks of independent numbers do not depend on
-    their minimum. So one number per slot is enough: the ranks choose the slots, and the minimum decides the rounding.
-    These numbers ``uniform`` (B, N) are on [0, 1).
+    """(B, N) bool: of the ``masked`` slots of each scene, those unmasked now, drawn without replacement. The masked
+    slots of a scene have the same ``chance`` (B, N). Of M masked slots with chance p, M p rounded down or up are
+    unmasked, with mean M p. The ranks of independent ``uniform`` numbers (B, N) on [0, 1) do not depend on their
+    minimum, so the ranks choose the slots, and the minimum decides the rounding.
 
     >>> masked = torch.tensor([[True, True, False, True, True]])
     >>> draw_unmasked(masked, torch.full((1, 5), 0.5), torch.tensor([[0.4, 0.9, 0.0, 0.2, 0.6]])).tolist()
@@ -269,12 +261,10 @@ def draw_unmasked(masked: Tensor, chance: Tensor, uniform: Tensor) -> Tensor:
 
 
 def systematic(unmasked: Tensor, uniform: Tensor) -> Tensor:
-    """(B, N) numbers on [0, 1) that are evenly spread over the ``unmasked`` slots of a scene, in random order.
-
-    Systematic sampling (Madow and Madow 1944): with k slots the numbers are (r + v) / k with the ranks r of ``uniform``
-    among these slots and one v for all, the fractional part of their sum. Ranks and v are independent, so each number
-    is uniform. Slots of equal probabilities p take a category p k times, rounded down or up. ``uniform`` (B, N) is
-    independent and uniform on [0, 1); slots that are not unmasked keep theirs.
+    """(B, N) numbers on [0, 1), evenly spread over the ``unmasked`` slots of a scene in random order (Madow and Madow
+    1944): for k slots (r + v) / k, r being the ranks of the independent ``uniform`` (B, N) on [0, 1) and v the
+    fractional part of their sum, independent of r, so each number is uniform. Slots of equal probabilities p take a
+    category p k times, rounded down or up. Other slots keep theirs.
 
     >>> unmasked = torch.tensor([[True, True, False, True, True]])
     >>> systematic(unmasked, torch.tensor([[0.75, 0.25, 0.5, 0.5, 0.125]])).tolist()
@@ -287,10 +277,9 @@ def systematic(unmasked: Tensor, uniform: Tensor) -> Tensor:
 
 
 def unmasking_log_prob(masked: Tensor, chance: Tensor, unmasked: Tensor) -> Tensor:
-    """(B, N) nats, whose sum over a scene's slots is the log-probability that exactly ``unmasked`` are unmasked.
-
-    It depends on no parameter of a network; the masked slots of a scene have equal shares of it. ``unmasked`` (B, N) is
-    a subset of the masked slots; the other arguments are those of :func:`draw_unmasked`.
+    """(B, N) nats, whose sum over a scene's slots is the log-probability that exactly ``unmasked``, a subset of the
+    masked slots, are unmasked by :func:`draw_unmasked`. It depends on no parameter of a network; a scene's masked slots
+    share it equally.
 
     >>> masked, chance = torch.ones(1, 4, dtype=torch.bool), torch.full((1, 4), 0.5)
     >>> two = torch.tensor([[True, False, True, False]])

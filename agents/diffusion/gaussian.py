@@ -32,25 +32,17 @@ _MIN_SLOTS = 20
 
 @dataclass(frozen=True)
 class CategoryMoments:
-    """Moments of normalised poses, category by category; the last of the K categories is *empty*.
+    """Moments of normalised poses, category by category; the last of the K categories is *empty*."""
 
-    Attributes:
-        share: (K,) frequency of each category among slots; sums to 1.
-        mean: (K, D).
-        std: (K, D), floored away from zero.
-    """
-
-    share: Tensor
-    mean: Tensor
-    std: Tensor
+    share: Tensor  # (K,) frequency of each category among slots; sums to 1
+    mean: Tensor  # (K, D)
+    std: Tensor  # (K, D), floored away from zero
 
     @classmethod
     def fit(cls, poses: Tensor, categories: Tensor, count: int, floor: float = 1e-3) -> CategoryMoments:
-        """Moments of poses (M, D) whose categories are (M,) in 0..``count`` - 1.
-
-        A category with fewer than 20 slots takes the moments of all objects, because too small a standard deviation
-        makes the targets of poses far from the mean very large. *Empty* has the mean of all objects and the standard
-        deviation ``floor``.
+        """Moments of poses (M, D) whose categories are (M,) in 0..``count`` - 1. A category with fewer than 20 slots
+        takes those of all objects, because too small a standard deviation makes the targets of poses far from the mean
+        very large. *Empty* has the mean of all objects and the standard deviation ``floor``.
         """
         poses = poses.double()
         object_poses = poses[categories != count - 1]
@@ -64,10 +56,9 @@ class CategoryMoments:
         return cls((share / share.sum()).float(), mean.float(), std.clamp(min=floor).float())
 
     def given_state(self, process: CategoricalProcess) -> tuple[Tensor, Tensor]:
-        """E[x_0 | state at t] and its standard deviation, (T + 1, K + 1, D) each, K being the mask token.
-
-        A state may be wrong where the kernel replaces categories. So the moments follow from the laws of total
-        expectation and variance over the clean category, whose posterior follows from ``share`` by Bayes' rule.
+        """E[x_0 | state at t] and its standard deviation, (T + 1, K + 1, D) each, K being the mask token. A state may
+        be wrong where the kernel replaces categories, so both follow from the laws of total expectation and variance
+        over the clean category, whose posterior follows from ``share`` by Bayes' rule.
         """
         categories = torch.arange(process.categories)
         steps = process.schedule.num_timesteps + 1
@@ -186,10 +177,9 @@ class NoiseSchedule:
 
 
 def karras_alpha_bar(num_timesteps: int, sigma_min: float = 0.002, sigma_max: float = 80.0, rho: float = 7.0) -> Tensor:
-    """(T + 1,) from noise levels spaced as in Karras et al. 2022, Eq. 5, from ``sigma_min`` at t = 1.
-
-    The lowest noise level is 0.002 of the data's unit, five times finer than with linear betas from 1e-4. An object
-    that stands and one that floats differ by a millimetre.
+    """(T + 1,) from noise levels spaced as in Karras et al. 2022, Eq. 5, from ``sigma_min`` at t = 1: 0.002 of the
+    data's unit, five times finer than linear betas from 1e-4, as an object that stands and one that floats differ by a
+    millimetre.
     """
     u = torch.linspace(0, 1, num_timesteps, dtype=torch.float64)
     low, high = sigma_min ** (1 / rho), sigma_max ** (1 / rho)
@@ -397,10 +387,8 @@ def timestep_weights(distribution: str, schedule: NoiseSchedule, mean: float, st
 
 
 def lognormal_timesteps(schedule: NoiseSchedule, mean: float, std: float) -> Tensor:
-    """(T + 1,) probabilities of drawing each timestep so that ln(noise-to-signal) ~ N(mean, std^2).
-
-    The distribution of Karras et al. (2022), Table 1, carried to a discrete schedule: the density at each level
-    times the width of the level. t = 0 has probability 0.
+    """(T + 1,) probabilities of drawing each timestep so that ln(noise-to-signal) ~ N(mean, std^2), 0 at t = 0: Karras
+    et al. (2022), Table 1, on a discrete schedule: the density at each level times the width of the level.
     """
     log_sigma = schedule.noise_to_signal[1:].log()
     width = torch.gradient(log_sigma)[0]
@@ -524,15 +512,10 @@ def check_weighting(kind: str, prediction: str) -> None:
 
 
 def loss_weights(schedule: NoiseSchedule, t: Tensor, prediction: str, kind: str) -> Tensor:
-    """(B,) float32 weights of the mean squares of the network's error at timesteps ``t`` (B,), int64 in 1..T.
-
-    ``"none"`` is 1 everywhere. ``"min_snr"`` (Hang et al. 2023, Eq. 8) gives the error of the clean scene the weight
-    min(SNR, gamma), with gamma :data:`MIN_SNR_GAMMA` and SNR being alpha_t^2 / sigma_t^2. The squared error of the
-    noise is SNR times that of the clean scene, and the squared error of v is SNR + 1 times that of the clean scene. So
-    their weights are min(SNR, gamma) / SNR and min(SNR, gamma) / (SNR + 1).
-
-    Raises:
-        UnknownNameError, InvalidInputError: the errors of :func:`check_weighting`.
+    """(B,) float32 weights of the mean squares of the network's error at ``t`` (B,), int64 in 1..T: 1 for ``"none"``.
+    For ``"min_snr"`` (Hang et al. 2023, Eq. 8) they are min(SNR, gamma) for the clean scene, with :data:`MIN_SNR_GAMMA`
+    and SNR = alpha_t^2 / sigma_t^2, min(SNR, gamma) / SNR for the noise, and min(SNR, gamma) / (SNR + 1) for v, whose
+    squared errors are SNR and SNR + 1 times that of the clean scene. Errors as for :func:`check_weighting`.
 
     >>> loss_weights(make_schedule("linear"), torch.tensor([1, 1000]), "x0", "min_snr").tolist()[0]
     5.0

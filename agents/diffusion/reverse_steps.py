@@ -43,9 +43,8 @@ class ReverseStep(Protocol):
 
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """(B, N) log-density in nats of independent normals at ``x`` (B, N, D), summed over the features of each slot.
-
-    ``mean`` is (B, N, D), ``std`` (N, D). An entry with std 0 is certain: it carries no probability and no gradient.
+    """(B, N) log-density in nats of independent normals at ``x`` (B, N, D), summed over the features of each slot, with
+    ``mean`` (B, N, D) and ``std`` (N, D). An entry with std 0 is certain: it carries no probability and no gradient.
 
     >>> x, std = torch.zeros(1, 1, 2), torch.tensor([[1.0, 0.0]])
     >>> round(float(gaussian_log_prob(x, torch.zeros(1, 1, 2), std)), 4)
@@ -200,9 +199,8 @@ def _shifted(mean: Tensor, shift: Tensor) -> Tensor:
 
 
 def _draw_grouped(probs: Tensor, groups: Tensor, uniform: Tensor, inner: Tensor) -> Tensor:
-    """(B, N) int64 categories, drawn with the weights ``probs`` (B, N, K).
-
-    ``uniform`` draws one of the ``groups`` (B, K), then ``inner`` draws a category of this group.
+    """(B, N) int64 categories, drawn with the weights ``probs`` (B, N, K): ``uniform`` draws one of the ``groups`` (B,
+    K), then ``inner`` draws a category of this group.
     """
     order = groups.argsort(dim=-1, stable=True)[:, None].expand_as(probs)
     sorted_groups = groups[:, None].expand_as(probs).gather(2, order)

@@ -121,7 +121,6 @@ def two_sample_accuracy(
     real: int, fake: int, prepare: Prepare, *, seeds: int, seed: int, config: ClassifierConfig
 ) -> Accuracy:
     """Train and test one classifier per seed, which ``prepare`` makes, each with a split, weights and order of its own.
-
     Rows 0 … real - 1 are real scenes, the following ``fake`` rows are samples. The larger class is subsampled to the
     size of the smaller one.
     """

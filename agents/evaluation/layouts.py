@@ -99,11 +99,6 @@ def _distances(batch: SceneBatch) -> Mapping[tuple[int, int], np.ndarray[tuple[i
 class Neighbors:
     """The nearest scene to each of B scenes.
 
-    Attributes:
-        distance: (B,) m, distance to the nearest scene; see :func:`scene_envs.scene.scene_distances`.
-        index: (B,) int64, index of the nearest scene.
-        copied: (B,) bool, whether one of the other scenes has the same assets, each within 1 cm of its counterpart.
-
     >>> from scene_envs.grammars import get_grammar
     >>> scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 6)
     >>> found = nearest_scenes(scenes[2:4], scenes)
@@ -111,9 +106,9 @@ class Neighbors:
     ([2, 3], [0.0, 0.0], [True, True])
     """
 
-    distance: Tensor
-    index: Tensor
-    copied: Tensor
+    distance: Tensor  # (B,) m, see :func:`scene_envs.scene.scene_distances`
+    index: Tensor  # (B,) int64
+    copied: Tensor  # (B,) bool, one of the other scenes has the same assets, each within 1 cm
 
 
 def nearest_scenes(batch: SceneBatch, others: SceneBatch, *, candidates: int = CANDIDATES) -> Neighbors:
@@ -200,9 +195,8 @@ def _close_pairs(positions: list[Array]) -> Index:
 
 
 def _features(batch: SceneBatch, limit: float) -> Tensor:
-    """(B, C * (1 + waves)) m: per asset, the sums over its objects of functions with slope <= 1 and range <= ``limit``.
-
-    The functions are the constant ``limit`` / 2 and waves of the position in random directions, equal for all scenes.
+    """(B, C * (1 + waves)) m: per asset, the sums over its objects of functions with slope <= 1 and range <= ``limit``:
+    the constant ``limit`` / 2 and waves of the position in random directions, equal for all scenes.
     """
     generator = torch.Generator().manual_seed(0)
     direction = torch.nn.functional.normalize(torch.randn(3, _WAVES, generator=generator), dim=0)
@@ -273,45 +267,30 @@ def stack_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
 class Support:
     """Support of objects of a scene type: a surface fixed in the world, or the top of another object.
 
-    Attributes:
-        kind: name under which the height error is reported, such as ``"table"`` or ``"stack"``.
-        height: z of the surface (m), in the world, or above the frame of the supporting object.
-        on: names of the supporting assets; None if the surface is fixed in the world.
-        riders: names of the assets that can rest there; None means all free ones.
-        reach: largest horizontal distance (m) between the frames of rider and supporting object.
-        catch: largest height error (m) at which a rider within reach is assigned to this support, even if another
-            surface is nearer; for supports that are thinner than the errors, such as a plate on a table.
-
     >>> [support.kind for support in SUPPORTS["dimsum_table"]]
     ['table', 'stack']
     """
 
-    kind: str
-    height: float
-    on: tuple[str, ...] | None = None
-    riders: tuple[str, ...] | None = None
-    reach: float = 0.06
-    catch: float = 0.0
+    kind: str  # name under which the height error is reported
+    height: float  # m, in the world, or above the frame of the supporting object
+    on: tuple[str, ...] | None = None  # names of the supporting assets; None if the surface is fixed in the world
+    riders: tuple[str, ...] | None = None  # names of the assets that can rest there; None means all free ones
+    reach: float = 0.06  # largest horizontal distance (m) between the frames
+    catch: float = 0.0  # height error (m) up to which a rider within reach is assigned here; for thin supports
 
 
 @dataclass(frozen=True)
 class Container:
     """Hollow assets, in which objects lie as they fell; these objects have no correct height and are left out.
 
-    Attributes:
-        names: names of the hollow assets.
-        riders: objects that may lie in them.
-        reach: largest horizontal distance (m) between the frames.
-        depth: largest height (m) of the rider's frame above the container's; the smallest is 1 cm.
-
     >>> [container.names for container in CONTAINERS]
     [('fruit_bowl',), ('bowl',), ('utensil_crock',)]
     """
 
     names: tuple[str, ...]
-    riders: tuple[str, ...]
-    reach: float
-    depth: float
+    riders: tuple[str, ...]  # objects that may lie in them
+    reach: float  # largest horizontal distance (m) between the frames
+    depth: float  # largest height (m) of the rider's frame above the container's; the smallest is 1 cm
 
 
 _FRUIT = (
@@ -379,10 +358,8 @@ CONTAINERS: tuple[Container, ...] = (
 
 
 def category_distribution(batch: SceneBatch, eps: float = KL_EPS) -> Tensor:
-    """Share of every asset among the objects of all scenes (welded ones included, empty slots ignored).
-
-    Returns:
-        (C,) float64, positive and summing to 1: ``eps`` is added to each share before renormalising.
+    """(C,) float64 share of every asset among the objects of all scenes (welded ones included, empty slots ignored),
+    positive and summing to 1: ``eps`` is added to each share before renormalising.
     """
     assets = batch.scene_type.num_assets
     counts = torch.bincount(batch.categories.flatten().cpu(), minlength=assets + 1)[:assets].double()
@@ -393,9 +370,8 @@ def category_distribution(batch: SceneBatch, eps: float = KL_EPS) -> Tensor:
 
 
 def category_kl(batch: SceneBatch, reference: SceneBatch) -> float:
-    """KL(reference ‖ samples) of the category distributions, nats; 0 when they agree.
-
-    The paper's category KL (section 4): it punishes assets that the samples lack.
+    """KL(reference ‖ samples) of the category distributions, nats (the paper's section 4): it punishes assets that the
+    samples lack.
 
     >>> category_kl(SceneBatch.empty("dimsum_table", 3), SceneBatch.empty("dimsum_table", 5))
     0.0
@@ -414,20 +390,10 @@ def count_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
 
 
 def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) -> dict[str, Tensor]:
-    """Distance in height between objects and the support nearest to each in height.
-
-    A surface fixed in the world is always a candidate. A support on another object is a candidate for the objects
-    within ``reach`` of it horizontally; where the top of the supporting object is above its frame, they must also be
-    above that frame. An object is counted under the kind of the candidate that is nearest to its own z. The error is
-    how far the object floats above, or is sunk into, the support that it seems to rest on. Objects that lie in a
-    container, see :data:`~agents.evaluation.layouts.CONTAINERS`, are left out.
-
-    Args:
-        batch: scenes to measure.
-        supports: surfaces on which objects may rest; None takes those of the scene type.
-
-    Returns:
-        For each kind, a (K,) float tensor of absolute errors in m; K is the number of objects of that kind.
+    """For each kind of support, (K,) m: how far each of its K objects floats above, or is sunk into, the support
+    nearest to it in height. All fixed surfaces are candidates, and so are the objects within ``reach`` horizontally;
+    the rider must be above the frame of an object whose top is above its frame. Objects that lie in one of the
+    :data:`CONTAINERS` are left out. ``supports`` None takes those of the scene type.
     """
     if supports is None:
         supports = SUPPORTS.get(batch.scene_type.name, ())

@@ -155,10 +155,8 @@ def grammar_scenes(scene_type: str | SceneType, count: int, seed: int = 0) -> Sc
 
 
 def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]:
-    """Figures that need no simulator: counts, categories, spacing, stacks, heights, workspace and duplicates.
-
-    Raises:
-        InvalidInputError: the scenes are of another type than the reference.
+    """Figures that need no simulator: counts, categories, spacing, stacks, heights, workspace and duplicates. An
+    InvalidInputError if the scenes are of another type than the reference.
     """
     counts = batch.counts
     divergence = category_kl(batch, reference)
@@ -192,42 +190,27 @@ def layout_figures(batch: SceneBatch, reference: SceneBatch) -> dict[str, float]
 class RealScenes:
     """Disjoint sets of real scenes.
 
-    Attributes:
-        reference: held-out scenes with which samples are compared.
-        floor: other held-out scenes, equivalent to samples of a perfect sampler.
-        training: scenes on which the prior may have been trained; None if the other scenes are from the grammar.
-
     >>> from scene_envs.scene_types import get_scene_type
     >>> real = RealScenes.load(get_scene_type("dimsum_table"), 2)
     >>> len(real.reference), len(real.floor), real.training
     (2, 2, None)
     """
 
-    reference: SceneBatch
-    floor: SceneBatch
-    training: SceneBatch | None = None
+    reference: SceneBatch  # held out; samples are compared with these
+    floor: SceneBatch  # held out too, equivalent to samples of a perfect sampler
+    training: SceneBatch | None = None  # the prior may have seen these; None if the others are from the grammar
 
     @classmethod
     def load(
         cls, scene_type: SceneType, count: int, *, data: str = "", heldout: str = "", training: int = 20_000,
         seed: int = 0,
     ) -> RealScenes:  # fmt: skip
-        """Held-out scenes, at most ``count`` in each of the two sets, and training scenes.
-
-        Args:
-            scene_type: scene type of the samples.
-            count: largest number of scenes in ``reference`` and in ``floor``.
-            data: dataset folder of the training scenes, or several joined by commas for a prior of their union;
-                empty takes fresh scenes of the grammar, and no training scenes.
-            heldout: dataset folder, or folders, of held-out scenes; empty takes the last scenes of ``data``, at most
-                half of it.
-            training: number of training scenes, drawn at random.
-            seed: seed of the grammar and of the draw.
-
-        Raises:
-            InvalidInputError: a folder does not exist, its scenes are of another type, there are fewer than four
-                held-out scenes, or a number is below 1.
-            CorruptFileError: a file cannot be read, lacks a column, or holds rows that are not scenes.
+        """At most ``count`` held-out scenes in each of the two sets, and ``training`` training scenes, drawn at random
+        from the dataset folders ``data``, joined by commas; empty takes fresh scenes of the grammar and no training
+        scenes. ``heldout`` names folders too; empty takes the last scenes of ``data``, at most half of it. An
+        InvalidInputError for a folder that does not exist, scenes of another type, fewer than four held-out scenes, or
+        a number below 1; a CorruptFileError for a file that cannot be read, lacks a column, or holds rows that are not
+        scenes.
         """
         if count < 2 or training < 1:
             raise InvalidInputError(
@@ -323,36 +306,24 @@ def _folders(text: str) -> list[str]:
 class EvaluationInputs:
     """Inputs of an evaluation.
 
-    Attributes:
-        samples: raw samples of a prior.
-        real: real scenes.
-        follow: function that samples a scene of the prior for each prompt; None for a prior that reads no prompts.
-        pool: physics workers; None computes in this process.
-        seed: seed of the classifiers and prompts.
-        fid_weights: path of the weights of an Inception-v3; empty for none.
-        prompts: number of real scenes whose prompts the samples follow; None for all of them.
-
     >>> empty = SceneBatch.empty("dimsum_table", 2)
     >>> compute_measure("layout", EvaluationInputs(empty, RealScenes(empty, empty)))["floor_objects_mean"]
     1.0
     """
 
-    samples: SceneBatch
+    samples: SceneBatch  # raw samples of a prior
     real: RealScenes
-    follow: Callable[[list[str]], SceneBatch] | None = None
-    pool: PhysicsPool | None = None
-    seed: int = 0
-    fid_weights: str = ""
-    prompts: int | None = None
+    follow: Callable[[list[str]], SceneBatch] | None = None  # samples a scene per prompt; None without prompts
+    pool: PhysicsPool | None = None  # None computes in this process
+    seed: int = 0  # of the classifiers and prompts
+    fid_weights: str = ""  # path of the weights of an Inception-v3
+    prompts: int | None = None  # number of real scenes whose prompts the samples follow; None for all
 
 
 def compute_measure(name: str, inputs: EvaluationInputs) -> Figures:
-    """The figures of one group, each with its floor: the same figure of real scenes against other real scenes.
-
-    Raises:
-        UnknownNameError: no such group.
-        InvalidInputError: the inputs lack something that the group needs.
-        MissingDependencyError: the group needs a package that is not installed.
+    """The figures of one group, each with its floor: the same figure of real scenes against other real scenes. Raises
+    an UnknownNameError, an InvalidInputError for inputs that lack something, or a MissingDependencyError for a
+    package.
     """
     if name not in MEASURES:
         raise unknown_name("measure", name, MEASURE_NAMES)
@@ -562,10 +533,8 @@ def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, flo
 
 
 def prompt_chance(batch: SceneBatch, prompts: Sequence[str], seed: int = 0) -> dict[str, float]:
-    """Shares of :func:`prompt_following` by chance, ``chance_<name>``: each scene has the prompt of another.
-
-    Raises:
-        InvalidInputError: there are fewer than two scenes.
+    """Shares of :func:`prompt_following` by chance, ``chance_<name>``: each scene has the prompt of another. An
+    InvalidInputError for fewer than two scenes.
     """
     if len(batch) < 2:
         raise InvalidInputError(f"chance needs at least 2 scenes to exchange prompts, got {len(batch)}")

@@ -45,11 +45,9 @@ def ready_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[st
 
 
 def penetration_totals(result: PenetrationResult) -> tuple[Tensor, Tensor]:
-    """(V,), (V,) m: total penetration of each valid scene, over pairs of convex parts and over pairs of objects.
-
-    The literature gives the first: the sum over all colliding pairs of collision geometries. It grows with the number
-    of parts an asset is made of. The second counts each pair of objects once, with its deepest overlap. Pairs in
-    contact (:data:`CONTACT`) are left out of both.
+    """(V,), (V,) m: total penetration of each valid scene over pairs of convex parts (as in the literature; it grows
+    with the number of parts of an asset), and over pairs of objects, each with its deepest overlap. Pairs in contact
+    (:data:`CONTACT`) are left out of both.
     """
     scenes = _valid_pairs(result)
     geometry = [sum(pair.total for pair in pairs) for pairs in scenes]
@@ -58,10 +56,8 @@ def penetration_totals(result: PenetrationResult) -> tuple[Tensor, Tensor]:
 
 
 def collision_rate(result: PenetrationResult) -> float:
-    """Share of the valid scenes in which some pair of objects overlaps deeper than 1 mm.
-
-    Raises:
-        InvalidInputError: no scene is valid.
+    """Share of the valid scenes in which some pair of objects overlaps deeper than 1 mm; an InvalidInputError without
+    any.
     """
     scenes = _valid_pairs(result)
     if not scenes:

@@ -63,10 +63,9 @@ def feature_distance(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def gaussian_distance(mean_a: ArrayLike, cov_a: ArrayLike, mean_b: ArrayLike, cov_b: ArrayLike) -> float:
-    """Squared 2-Wasserstein distance of two Gaussians (Dowson and Landau 1982).
-
-    ``|m_a - m_b|² + tr(S_a + S_b - 2 (S_a^½ S_b S_a^½)^½)``, by symmetric eigendecompositions, which also work for
-    singular covariances (F, F); means are (F,).
+    """Squared 2-Wasserstein distance of two Gaussians with means (F,) and covariances (F, F), which may be singular
+    (Dowson and Landau 1982): ``|m_a - m_b|² + tr(S_a + S_b - 2 (S_a^½ S_b S_a^½)^½)``, by symmetric
+    eigendecompositions.
 
     >>> gaussian_distance([0.0], [[1.0]], [3.0], [[4.0]])
     10.0
@@ -121,9 +120,8 @@ def frechet_inception_distance(
 
 
 def load_inception(weights: str | os.PathLike[str]) -> nn.Module:
-    """An Inception-v3 that gives its 2048 pooled features for images (B, 3, 299, 299) in -1 … 1.
-
-    Arguments and errors as for :func:`frechet_inception_distance`.
+    """An Inception-v3 that gives its 2048 pooled features for images (B, 3, 299, 299) in -1 … 1. Arguments and errors
+    as for :func:`frechet_inception_distance`.
     """
     path = Path(weights)
     if not path.is_file():

@@ -51,25 +51,15 @@ _MIN_STD = 1e-4
 
 @dataclass(frozen=True)
 class SceneTokens:
-    """B scenes of up to N objects; rows past the objects of a scene are padding.
+    """B scenes of up to N objects; rows past the objects of a scene are padding."""
 
-    Attributes:
-        poses: (B, N, 12) translation (m) and rotation matrix row-major.
-        waves: (B, N, 26) Fourier features of the translation.
-        categories: (B, N) int64 asset, C where there is none.
-        extents: (B, N, 3) asset bounding box, m.
-        offsets: (B, N, K, 7) offsets to each of the nearest neighbours, see :func:`scene_tokens`.
-        neighbours: (B, N, K) int64 assets of these neighbours, C where there is none.
-        present: (B, N) bool, False for padding.
-    """
-
-    poses: Tensor
-    waves: Tensor
-    categories: Tensor
-    extents: Tensor
-    offsets: Tensor
-    neighbours: Tensor
-    present: Tensor
+    poses: Tensor  # (B, N, 12) translation (m) and rotation matrix row-major
+    waves: Tensor  # (B, N, 26) Fourier features of the translation
+    categories: Tensor  # (B, N) int64 asset, C where there is none
+    extents: Tensor  # (B, N, 3) asset bounding box, m
+    offsets: Tensor  # (B, N, K, 7) offsets to each of the nearest neighbours, see :func:`scene_tokens`
+    neighbours: Tensor  # (B, N, K) int64 assets of these neighbours, C where there is none
+    present: Tensor  # (B, N) bool, False for padding
 
     def __len__(self) -> int:
         return self.poses.shape[0]
@@ -82,16 +72,10 @@ class SceneTokens:
 
 
 def scene_tokens(batch: SceneBatch, neighbours: int = NEIGHBOURS) -> SceneTokens:
-    """Describe every object of every scene; the order of the slots affects only the order of the rows.
-
-    The neighbours of an object are those whose world-aligned bounding boxes come nearest to its own, or overlap it
-    most; among equals, those whose centres are nearest. Each neighbour has these numbers: the offset of its frame, as
-    asinh(offset / 0.1 m); the gap between the two boxes along x, y and z (negative where they overlap), and the gap
-    between the circles around the two outlines seen from above, as asinh(gap / 5 mm).
-
-    Args:
-        batch: B scenes.
-        neighbours: number K of neighbours.
+    """Describe every object of every scene; the order of the slots affects only the order of the rows. The K
+    ``neighbours`` of an object are those whose world-aligned boxes come nearest or overlap most; among equals, the
+    nearest centres. Each has the offset of its frame, asinh(offset / 0.1 m), and as asinh(gap / 5 mm) the gaps of the
+    boxes along x, y and z (negative for overlap) and of the circles around the outlines seen from above.
     """
     if not len(batch):
         raise InvalidInputError("a learned measure needs at least one scene, got none")
@@ -108,9 +92,8 @@ def scene_tokens(batch: SceneBatch, neighbours: int = NEIGHBOURS) -> SceneTokens
 def blurred(
     batch: SceneBatch, translation: float | Tensor, rotation: float | Tensor, generator: torch.Generator
 ) -> SceneBatch:
-    """The scenes with Gaussian noise on all poses, of standard deviation ``translation`` (m) and ``rotation`` (rad).
-
-    Each is a number, or a tensor that broadcasts to (B, N, 3); rotation vectors get the noise of rotations.
+    """The scenes with Gaussian noise on all poses, of standard deviation ``translation`` (m) and ``rotation`` (rad),
+    numbers or tensors that broadcast to (B, N, 3); rotation vectors get the noise of rotations.
     """
     shape = batch.translations.shape
     shift = translation * torch.randn(shape, generator=generator)
@@ -235,10 +218,9 @@ class _InducedBlock(nn.Module):
 
 
 class _ObjectEncoder(nn.Module):
-    """Encoder of the objects of a scene: one token each, which depends on the other objects and not on padding.
-
-    A Set Transformer (Lee et al. 2019) with induced attention. Before the attention, a small MLP over pairs reads the
-    nearest neighbours of each object; overlaps and distances enter there.
+    """Set Transformer (Lee et al. 2019) with induced attention: one token per object, which depends on the other
+    objects and not on padding. Before the attention, a small MLP over pairs reads the nearest neighbours: overlaps and
+    distances.
     """
 
     def __init__(self, config: SetNetworkConfig) -> None:
@@ -275,8 +257,7 @@ class _ObjectEncoder(nn.Module):
 
 class ObjectNetwork(_ObjectEncoder):
     """Network with one logit for each object of a scene, from its neighbours, and from all objects if ``blocks`` > 0.
-
-    ``outputs`` and ``dropout`` of the config are not read.
+    It does not read ``outputs`` and ``dropout`` of the config.
 
     >>> network = ObjectNetwork(SetNetworkConfig(features=5, categories=4, outputs=1))
     >>> objects = torch.randn(2, 6, 5), torch.randint(4, (2, 6)), torch.randn(2, 6, 3, 7), torch.randint(4, (2, 6, 3))
@@ -297,9 +278,8 @@ class ObjectNetwork(_ObjectEncoder):
 
 
 class SetNetwork(_ObjectEncoder):
-    """Network with ``outputs`` numbers for a scene, invariant to the order of objects and to padding.
-
-    The tokens of the objects are pooled by attention, mean, maximum and a scaled sum.
+    """Network with ``outputs`` numbers for a scene, invariant to the order of objects and to padding. The tokens of the
+    objects are pooled by attention, mean, maximum and a scaled sum.
 
     >>> network = SetNetwork(SetNetworkConfig(features=5, categories=4, outputs=2)).eval()
     >>> objects = torch.randn(2, 6, 5), torch.randint(4, (2, 6)), torch.randn(2, 6, 3, 7), torch.randint(4, (2, 6, 3))
@@ -322,10 +302,9 @@ class SetNetwork(_ObjectEncoder):
         self._reset_embeddings()
 
     def forward(self, own: Tensor, categories: Tensor, offsets: Tensor, neighbours: Tensor, present: Tensor) -> Tensor:
-        """(B, ``outputs``) logits or features.
-
-        Objects have features ``own`` (B, N, F) and ``categories`` (B, N), their neighbours ``offsets`` (B, N, K, P) and
-        categories ``neighbours`` (B, N, K); ``present`` (B, N) is False for padding.
+        """(B, ``outputs``) logits or features. Objects have features ``own`` (B, N, F) and ``categories`` (B, N), their
+        neighbours ``offsets`` (B, N, K, P) and categories ``neighbours`` (B, N, K); ``present`` (B, N) is False for
+        padding.
         """
         tokens, mask = self.encode(own, categories, offsets, neighbours, present)
         somewhere = present.any(dim=-1, keepdim=True)
@@ -398,15 +377,10 @@ def _pairs(tokens: SceneTokens, width: int) -> Tensor:
 
 
 class SetEncoder(nn.Module):
-    """Encoder of scenes of any type to 64 features; invariant to the order of slots and to empty slots.
-
-    Categories are read by asset name, so that a scene has the same features in a union of types as in its own type. An
-    asset outside the vocabulary becomes the *unknown* asset, of which the encoder reads the bounding box but no name.
-    Distances between scenes of users' own assets depend on sizes, poses and gaps, and not on names.
-
-    Args:
-        vocabulary: names of the known assets.
-        config: sizes of the network; None takes those of the shipped one.
+    """Encoder of scenes of any type to 64 features; invariant to the order of slots and to empty slots. It reads
+    categories by asset name, so a scene has the same features in a union of types as in its own type. Of an asset
+    outside ``vocabulary`` it reads the bounding box but no name, so distances of users' own assets depend on sizes,
+    poses and gaps. ``config`` None takes the sizes of the shipped network.
 
     >>> encoder = SetEncoder(("cafe_table", "teacup")).eval()
     >>> encoder.features(SceneBatch.empty("dimsum_table", 2)).shape
@@ -454,11 +428,8 @@ class SetEncoder(nn.Module):
         return (raw - self.mean) @ self.whitening
 
     def save(self, path: str | os.PathLike[str], note: str = "") -> Path:
-        """Write weights (float16; mean and whitening float32), vocabulary and size to one ``.safetensors`` file.
-
-        Args:
-            path: file to write.
-            note: a sentence on how the encoder was trained, kept in the file.
+        """Write weights (float16; mean and whitening float32), vocabulary, size and ``note``, a sentence on the
+        training, to one ``.safetensors`` file.
         """
         weights = {name: value.detach().contiguous() for name, value in self.state_dict().items()}
         weights = {name: value.half() if name.startswith("network.") else value for name, value in weights.items()}
@@ -467,11 +438,8 @@ class SetEncoder(nn.Module):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str] | None = None) -> SetEncoder:
-        """The encoder in ``path``, frozen and in evaluation mode; None takes the shipped one.
-
-        Raises:
-            InvalidInputError: the file does not exist.
-            CorruptFileError: the file was not written by :meth:`save`.
+        """The encoder in ``path`` (None: the shipped one), frozen and in evaluation mode; an InvalidInputError if there
+        is no such file, a CorruptFileError if :meth:`save` did not write it.
         """
         return _load(str(SHIPPED if path is None else Path(path).resolve()))
 

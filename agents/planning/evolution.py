@@ -111,14 +111,10 @@ _MIN_SHARE = 0.25
 def spliced(
     first: SceneBatch, second: SceneBatch, first_mask: Tensor, second_mask: Tensor, rng: np.random.Generator
 ) -> Tensor:
-    """One scene with the objects of ``first`` on one side of a vertical plane, and those of ``second`` on the other.
-
-    The plane has a random direction. Its place is the one at which most objects are kept. About a quarter of the
-    objects of both scenes together, or more, are on either side. If there are too few slots, the objects nearest to the
-    plane are left out. The scene has the fixed objects of ``first``; slots of the masks (N,) are left out.
-
-    Returns:
-        (N, D) raw scene.
+    """(N, D) raw scene with the objects of ``first`` on one side of a vertical plane of random direction, and those of
+    ``second`` on the other. The plane is placed where most objects are kept, with about a quarter of them or more on
+    either side; with too few slots, those nearest to it are left out. The fixed objects are those of ``first``; slots
+    of the masks (N,) are left out.
     """
     import torch
 

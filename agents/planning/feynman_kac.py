@@ -27,10 +27,9 @@ if TYPE_CHECKING:
 
 
 def systematic(weights: np.ndarray, uniform: float) -> np.ndarray:
-    """(K,) index of the particle that each place continues with: systematic resampling (Carpenter et al. 1999).
-
-    Let w_i be the share of particle i in the sum of the weights (K,). Particle i gets K w_i places on average over
-    ``uniform`` in [0, 1), and always K w_i rounded down or up. A particle that gets any place keeps its own.
+    """(K,) index of the particle that each place continues with: systematic resampling (Carpenter et al. 1999). A
+    particle with share w_i of the sum of the weights (K,) gets K w_i places on average over ``uniform`` in [0, 1), and
+    always K w_i rounded down or up. A particle that gets any place keeps its own.
 
     >>> systematic(np.array([0.5, 0.0, 0.5, 0.0]), 0.5).tolist()
     [0, 0, 2, 2]
@@ -46,12 +45,10 @@ def systematic(weights: np.ndarray, uniform: float) -> np.ndarray:
 
 
 class Particles:
-    """Resampler of groups of particles; a group is the children of one parent that are denoised in one batch.
-
-    At ``resamplings`` steps, each group is resampled with the weights exp(strength * (value - value at the last
-    resampling)). The product of the weights of a path is then exp(strength * last value) (Singhal et al. 2025,
-    difference potential). ``parents`` (B,) are hashable and have a generator each in ``rngs``; ``values`` gives Φ (B,)
-    of denoised scenes.
+    """Resampler of groups of particles, the children of one parent (``parents`` (B,) are hashable and have a generator
+    each in ``rngs``) that are denoised in one batch. At ``resamplings`` steps the weights are exp(strength * (value -
+    value at the last resampling)), whose product along a path is exp(strength * last value) (Singhal et al. 2025,
+    difference potential). ``values`` gives Φ (B,) of denoised scenes.
     """
 
     def __init__(

@@ -105,11 +105,9 @@ Differentiable in ``translations``.
 
 
 def overlap(batch: SceneBatch, translations: Tensor) -> Tensor:
-    """(B,) minus half the sum of squared overlaps of objects, mm²: 0 where no two overlap.
-
-    Each object is the upright cylinder around its asset. The overlap of a pair is the smaller of the overlap of their
-    circles and that of their heights. Pairs of two welded objects are left out, and pairs in which one circle contains
-    the centre of the other.
+    """(B,) minus half the sum of squared overlaps of objects, mm². Each object is the upright cylinder around its
+    asset; a pair overlaps by the smaller of the overlaps of circles and of heights. Pairs of two welded objects are
+    left out, and pairs in which one circle contains the centre of the other.
     """
     import torch
 
@@ -151,11 +149,10 @@ class Guidance:
         self.weight, self.strength, self.begin = weight, strength, begin
 
     def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch], std: Tensor) -> Tensor | None:
-        """(B, N, 3) m, shift of the denoised translations; None at a step without guidance.
-
-        Given x_t, x_0 is approximately normal around the denoised scene, with standard deviation ``std`` (3,), m. The
-        weight moves its mean by the variance times the gradient of the log-weight. This is exact if the gradient is
-        constant. No object moves by more than one standard deviation.
+        """(B, N, 3) m, shift of the denoised translations; None at a step without guidance. Given x_t, x_0 is about
+        normal around the denoised scene with standard deviation ``std`` (3,), m, so the weight moves its mean by the
+        variance times the gradient of the log-weight, exactly if that is constant. No object moves by more than one
+        standard deviation.
         """
         if step < int(self.begin * steps) or not self.strength:
             return None

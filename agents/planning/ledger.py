@@ -81,17 +81,11 @@ class PlanResult:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A state that was expanded.
+    """A state that was expanded."""
 
-    Attributes:
-        state: the problem's own immutable state.
-        value: objective of the state, in [0, 1]; NaN if it could not be scored.
-        path: actions from the root to the state.
-    """
-
-    state: Any
-    value: float
-    path: tuple[int, ...]
+    state: Any  # the problem's own immutable state
+    value: float  # objective of the state, in [0, 1]; NaN if it could not be scored
+    path: tuple[int, ...]  # actions from the root to the state
 
     @property
     def valid(self) -> bool:
@@ -190,10 +184,8 @@ class SearchBudget:
 
 
 class SteeredProblem:
-    """A search problem whose expansions get ``steering``, which the planner called ``planner`` may change.
-
-    Raises:
-        InvalidInputError: the expansions of ``problem`` cannot be steered.
+    """A search problem whose expansions get ``steering``, which the planner called ``planner`` may change; an
+    InvalidInputError if the expansions of ``problem`` cannot be steered.
     """
 
     def __init__(self, problem: Any, planner: str, steering: Any = None) -> None:
@@ -279,11 +271,7 @@ def list_planners() -> list[str]:
 
 
 def planner_settings(name: str) -> type[PlannerSettings]:
-    """The dataclass of a planner's keys.
-
-    Raises:
-        UnknownNameError: no planner has that name; the nearest known one is offered.
-    """
+    """The dataclass of a planner's keys; an UnknownNameError offers the nearest known name."""
     return _PLANNERS[name]
 
 

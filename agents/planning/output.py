@@ -191,7 +191,6 @@ def search_metrics(
     from_scenes: bool,
 ) -> dict[str, Any]:
     """The figures of a run that generated ``spent`` scenes; ``stopped`` says why it ended early, and may be empty.
-
     ``firsts`` has the best of the first samples of each search, or its start scene, by the seed of the search.
     """
     search = min(searches, key=loss_of)
@@ -235,10 +234,9 @@ def _of_plan(plan: PlanResult) -> dict[str, Any]:
 def draw_curve(
     curves: Mapping[str, Sequence[float]], path: Path, *, num_steps: int, first: int, scale: float, label: str
 ) -> None:
-    """Draw the best objective against denoiser evaluations, ``num_steps`` per scene, one line per planner.
-
-    ``curves`` has the best Φ after each generated scene; values that are not finite are left out. A line marks the end
-    of the ``first`` scenes, the fresh samples. ``scale`` is the objective called ``label`` at Φ = 1.
+    """Draw the best Φ after each generated scene (finite ``curves``) against denoiser evaluations, ``num_steps`` per
+    scene, one line per planner. A line marks the end of the ``first`` scenes, the fresh samples. ``scale`` is the
+    objective called ``label`` at Φ = 1.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -276,18 +274,14 @@ def draw_scene(scene: SceneBatch, state: Any, path: Path) -> None:
 
 @dataclass(frozen=True)
 class Card:
-    """A scene in the drawing of the best scenes and their ancestors.
-
-    ``column`` is the depth, 0 for first samples or the start scene; a first child is in the ``row`` of its ``parent``,
-    an index of cards. ``number`` counts the search's scenes from 1. ``frame`` is the scene's index in the 3-D view.
-    """
+    """A scene in the drawing of the best scenes and their ancestors."""
 
     node: TreeNode
-    column: int
-    row: int
-    parent: int | None
-    number: int
-    frame: int | None
+    column: int  # depth, 0 for first samples or the start scene
+    row: int  # a first child is in the row of its parent
+    parent: int | None  # index of cards
+    number: int  # of the scene in the search, from 1
+    frame: int | None  # index in the 3-D view
     on_path: bool
 
 
@@ -320,10 +314,9 @@ def write_tree_page(
     *,
     returned: SceneBatch | None = None,
 ) -> None:
-    """Write the page of the first search of ``record``, which works offline and without other files.
-
-    ``scenes`` has a batch of one for each id of :func:`shown_nodes`. ``returned`` is the scene that the search
-    returned, if it is not a node because the planner changed it at the end.
+    """Write the page of the first search of ``record``, which works offline and without other files. ``scenes`` has a
+    batch of one for each id of :func:`shown_nodes`; ``returned`` is the scene that the search returned, if it is not a
+    node because the planner changed it at the end.
     """
     from jinja2.utils import htmlsafe_json_dumps
     from markupsafe import Markup
@@ -379,9 +372,8 @@ def write_tree_page(
 
 
 def _cards(record: SearchRecord, shown: Sequence[int], way: Sequence[int]) -> list[Card]:
-    """The cards of the shown scenes and of all their ancestors except an empty root, parents first.
-
-    The best path is in the first row. A chain of first children takes the highest row that is free in all its columns.
+    """The cards of the shown scenes and of all their ancestors except an empty root, parents first. The best path is in
+    the first row; a chain of first children takes the highest row that is free in all its columns.
     """
     frames, on_path = {node: frame for frame, node in enumerate(shown)}, set(way)
     number = {node.id: k for k, node in enumerate(record.tree_of(0))}

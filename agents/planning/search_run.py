@@ -224,9 +224,8 @@ class _Run:
         progress: Progress | None,
         max_seconds: float = math.inf,
     ) -> tuple[SearchEnv, Session, list[PlanResult]]:
-        """The environment with ``actions`` actions per state, the session, and a plan per search of ``part``.
-
-        Each plan has a budget of ``budget`` scenes.
+        """The environment with ``actions`` actions per state, the session, and a plan of ``budget`` scenes per search
+        of ``part``.
         """
         config = self.config
         if config.masks is None:

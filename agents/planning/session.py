@@ -134,10 +134,9 @@ def _state(values: Mapping[str, Any]) -> SearchState:
 
 
 def _described(value: Any) -> str:
-    """A setting as text, the same in every process.
-
-    A prior is described by its weights, an object with an attribute ``described_by`` by the value of this attribute, a
-    dataclass by its class and the fields that differ from the defaults, and other objects by their class alone.
+    """A setting as text, the same in every process: a prior by its weights, an object with ``described_by`` by its
+    value, a dataclass by its class and the fields that differ from the defaults, and other objects by their class
+    alone.
     """
     if isinstance(value, str | int | float | bool | None):
         return repr(value)
@@ -174,12 +173,9 @@ Ask = Callable[[Request], Sequence[Any]]
 
 
 class Lane:
-    """One plan's view of a session: the environment with the plan's own root, and a record of the plan's expansions.
-
-    Attributes:
-        values: objective of every expansion; NaN where it failed.
-        best: the highest value and its state.
-        first: children of the root, in the order they were made.
+    """One plan's view of a session: the environment with the plan's own root, and a record of the plan's expansions:
+    their ``values`` (NaN where one failed), the ``best`` value and its state, and the children of the root, ``first``,
+    in order.
     """
 
     def __init__(self, problem: Searchable, root: Any, budget: int, ask: Ask, root_counts: bool = False) -> None:

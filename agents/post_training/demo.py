@@ -47,28 +47,11 @@ def run_demo(
     num_steps: int = 50,
     runs: Mapping[str, Sequence[str]] = RUNS,
 ) -> dict[str, Any]:
-    """Post-train a prior in two ways at the same time, measure all three priors on fresh samples, and write the report.
-
-    All priors start from the same noise, and every sample is measured. Physics decides which objects are
-    simulation-ready.
-
-    Args:
-        output: folder for ``report.html``, ``metrics.json``, the pictures, and one folder per run, ``clutter`` and
-            ``feasible``, which ``prior=`` loads. An interrupted demonstration is resumed.
-        seed: seed of training, from which the seed of the measured samples is derived.
-        workers: physics worker processes, of both runs together while they train.
-        device: torch device of the networks.
-        progress: style of the progress display of both runs, as in :class:`~scene_envs.progress.Progress`.
-        scenes: number of fresh samples of each prior.
-        num_steps: denoiser evaluations per measured sample.
-        runs: names of the runs, and their keys of ``post-train`` in addition to output, seed and workers.
-
-    Returns:
-        The numbers of ``metrics.json``: those of ``measure_prior`` for ``base`` and each run, ``runs`` (the metrics of
-        each run), and ``seconds``.
-
-    Raises:
-        TrainingError: a run failed; its message stands on stderr. A second call resumes the runs.
+    """Post-train a prior with the keys of each of ``runs`` at the same time, measure all priors on ``scenes`` samples
+    from the same noise, and write report.html, metrics.json, pictures and a folder per run, which ``prior=`` loads, to
+    ``output``. Both runs together have ``workers`` physics workers. Returns the numbers of metrics.json: those of
+    ``measure_prior`` for ``base`` and each run, the metrics of ``runs``, and ``seconds``. A TrainingError, with the
+    cause on stderr, if a run failed; a second call resumes the runs.
     """
     from scene_envs.physics import make_pool
 
@@ -117,9 +100,8 @@ class _Finished:
 
 @contextmanager
 def _post_training(commands: Mapping[str, Sequence[str]]) -> Iterator[dict[str, subprocess.Popen[str]]]:
-    """Context in which ``scene-envs post-train`` runs with each list of keys, and with an equal part of the cores.
-
-    Runs that are not finished at the end of the context save and end.
+    """Context in which ``scene-envs post-train`` runs with each list of keys, and with an equal part of the cores. Runs
+    that are not finished at the end of the context save and end.
     """
     threads = str(max(1, len(os.sched_getaffinity(0)) // len(commands)))
     paths = os.pathsep.join(entry or os.getcwd() for entry in sys.path)

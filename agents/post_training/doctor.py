@@ -29,56 +29,32 @@ MAX_STEP_SHARE = 0.7
 
 @dataclass(frozen=True)
 class StepRow:
-    """One step of the chain.
+    """One step of the chain."""
 
-    Attributes:
-        step: index in the step table.
-        timestep: timestep at which the step starts.
-        std: smallest standard deviation of the step over random entries, normalised units.
-        weight: weight in the policy gradient; 0 leaves the step out.
-        gradient_norm: norm of this step's policy gradient alone; 0 if the step is left out.
-    """
-
-    step: int
-    timestep: int
-    std: float
-    weight: float
-    gradient_norm: float
+    step: int  # index in the step table
+    timestep: int  # at which the step starts
+    std: float  # smallest standard deviation over random entries, normalised units
+    weight: float  # in the policy gradient; 0 leaves the step out
+    gradient_norm: float  # of this step's policy gradient alone; 0 if the step is left out
 
 
 @dataclass(frozen=True)
 class DoctorReport:
-    """Findings of the doctor.
+    """Findings of the doctor."""
 
-    Attributes:
-        log_ratio: largest |log p_now - log p_sampling|; exactly 0 if sampler and loss agree.
-        steps: one row per step of the chain.
-        reward_mean: mean reward of one batch.
-        reward_std: standard deviation of the batch's rewards.
-        reward_min: smallest reward of the batch.
-        reward_max: largest reward of the batch.
-        valid_fraction: share of scenes in the batch that were scored.
-        policy_gradient_norm: gradient norm of the score-function part.
-        pretraining_gradient_norm: gradient norm of the regularisation, its coefficient included.
-        sampling_seconds: duration of sampling and scoring one batch.
-        update_seconds: duration of one update.
-        iterations: number of iterations of the run, for the estimate of its duration.
-        advice: recommended changes in words; empty if none is needed.
-    """
-
-    log_ratio: float
+    log_ratio: float  # largest |log p_now - log p_sampling|; exactly 0 if sampler and loss agree
     steps: list[StepRow]
-    reward_mean: float
+    reward_mean: float  # of one batch, as the next three
     reward_std: float
     reward_min: float
     reward_max: float
-    valid_fraction: float
-    policy_gradient_norm: float
-    pretraining_gradient_norm: float
-    sampling_seconds: float
-    update_seconds: float
-    iterations: int
-    advice: list[str] = field(default_factory=list)
+    valid_fraction: float  # share of scenes that were scored
+    policy_gradient_norm: float  # of the score-function part
+    pretraining_gradient_norm: float  # of the regularisation, its coefficient included
+    sampling_seconds: float  # sampling and scoring one batch
+    update_seconds: float  # one update
+    iterations: int  # of the run, for the estimate of its duration
+    advice: list[str] = field(default_factory=list)  # recommended changes in words
 
     @property
     def gradient_ratio(self) -> float:
@@ -97,11 +73,8 @@ class DoctorReport:
 
 
 def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> DoctorReport:
-    """Examine a configuration with one batch of scenes; nothing is trained and nothing is written.
-
-    Args:
-        config: configuration of the planned run.
-        prior: prior to start from, in place of the one that ``config.prior`` names.
+    """Examine a configuration with one batch of scenes; nothing is trained or written. ``prior`` replaces the one that
+    ``config.prior`` names.
     """
     with TemporaryDirectory() as scratch:
         real = config.regularisation

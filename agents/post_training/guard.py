@@ -202,17 +202,6 @@ class Guard:
 class SampleCheck:
     """Check that samples a prior from the same noise at every call, and measures the samples.
 
-    Attributes:
-        real: real scenes that are not used in training.
-        scorer: scorer of the run's reward.
-        count: number of samples.
-        num_steps: denoising steps per sample.
-        seed: seed of the noise.
-        slots: slots per sample.
-        prompts: one prompt per sample; None without prompts.
-        guidance: weight of classifier-free guidance.
-        claim_guidance: strength of claim guidance.
-
     >>> from agents.priors.testing import tiny_prior
     >>> scorer = RewardScorer("object_count")
     >>> prior = tiny_prior()
@@ -221,15 +210,15 @@ class SampleCheck:
     ['category_kl', 'classifier_accuracy', 'count_distance', 'sample_reward', 'stack_distance']
     """
 
-    real: SceneBatch
-    scorer: RewardScorer
-    count: int
-    num_steps: int
+    real: SceneBatch  # scenes that are not used in training
+    scorer: RewardScorer  # of the run's reward
+    count: int  # number of samples
+    num_steps: int  # denoising steps per sample
     seed: int
-    slots: int | None = None
-    prompts: Sequence[str] | None = None
-    guidance: float = 0.0
-    claim_guidance: float = 0.0
+    slots: int | None = None  # per sample
+    prompts: Sequence[str] | None = None  # one per sample
+    guidance: float = 0.0  # weight of classifier-free guidance
+    claim_guidance: float = 0.0  # strength
 
     @torch.no_grad()
     def sample(self, prior: ScenePrior) -> SceneBatch:
@@ -258,11 +247,9 @@ class SampleCheck:
         return batch.tensor.cpu()
 
     def figures(self, batch: SceneBatch) -> dict[str, float]:
-        """Mean reward of ``batch``, and figures of its difference from the real scenes.
-
-        The difference is measured by the distances of object counts and of tallest stacks (objects), by the KL
-        divergence of categories (nats), and by the accuracy of a classifier (share of scenes). A figure that has no
-        meaning, such as the categories of empty scenes, is NaN. Assets without geometry have no stacks.
+        """Mean reward, and differences from the real scenes: distances of object counts and of tallest stacks
+        (objects), KL divergence of categories (nats), and accuracy of a classifier (share of scenes). A figure that has
+        no meaning, such as the categories of empty scenes, is NaN. Assets without geometry have no stacks.
         """
         from agents.evaluation.classifier import classifier_accuracy
         from agents.evaluation.layouts import category_kl, count_wasserstein, stack_wasserstein
@@ -281,9 +268,8 @@ class SampleCheck:
 
 
 def beyond(figures: Mapping[str, float], base: Mapping[str, float], limits: Mapping[str, float]) -> list[str]:
-    """Names of the figures that exceed the base prior's by more than their limit; figures without a limit never do.
-
-    A limit of a figure that was not measured is ignored.
+    """Names of the figures that exceed the base prior's by more than their limit. Figures without a limit, and limits
+    of figures that were not measured, do not count.
 
     >>> beyond({"category_kl": 0.3}, {"category_kl": 0.1}, {"category_kl": 0.1, "stack_distance": 0.5})
     ['category_kl']
@@ -294,27 +280,16 @@ def beyond(figures: Mapping[str, float], base: Mapping[str, float], limits: Mapp
 
 @dataclass(frozen=True)
 class GuardReading:
-    """Result of one check.
-
-    Attributes:
-        iteration: iteration of the check.
-        loss: pretraining loss on the held-out real scenes, noise and timesteps fixed.
-        ratio: ``loss`` divided by that of the base prior.
-        reward: mean reward of the samples; without samples, mean valid reward since the check before.
-        realism: figures of the last rollout's scenes, such as ``workspace_fraction``.
-        kept: whether this became the best checkpoint.
-        samples: figures of samples; empty at a check of the loss alone.
-        beyond: names of the figures beyond their limit.
-    """
+    """Result of one check."""
 
     iteration: int
-    loss: float
-    ratio: float
-    reward: float
-    realism: dict[str, float] = field(default_factory=dict)
-    kept: bool = False
-    samples: dict[str, float] = field(default_factory=dict)
-    beyond: tuple[str, ...] = ()
+    loss: float  # pretraining loss on the held-out real scenes, noise and timesteps fixed
+    ratio: float  # ``loss`` divided by that of the base prior
+    reward: float  # mean of the samples; without samples, mean valid reward since the check before
+    realism: dict[str, float] = field(default_factory=dict)  # of the last rollout, such as ``workspace_fraction``
+    kept: bool = False  # whether this became the best checkpoint
+    samples: dict[str, float] = field(default_factory=dict)  # figures of samples; empty at a check of the loss alone
+    beyond: tuple[str, ...] = ()  # names of the figures beyond their limit
 
 
 def realism(batch: SceneBatch) -> dict[str, float]:

@@ -49,18 +49,9 @@ FIRST_STEPS = 150
 
 class Learner:
     """Samples scenes under the current policy and updates it. All randomness depends on (seed, purpose, iteration).
-
-    Args:
-        policy: policy whose prior is trained.
-        reward: resolved reward, as :func:`rewards.process.run_reward` gives it.
-        algorithm: settings of the algorithm.
-        optimizer: settings of the optimiser.
-        regularisation: settings of the regularisation.
-        batch_size: number of scenes of a batch, over all processes.
-        slots: slots per scene; None takes as many as the prior was trained on.
-        prompt: source of the prompts, as in :class:`~agents.post_training.rollouts.PromptDeck`; None for no prompts.
-        workers: physics worker processes, or ``"ray"``.
-        seed: seed of the run.
+    ``reward`` is resolved by :func:`rewards.process.run_reward`; ``batch_size`` counts the scenes of all processes;
+    ``slots`` None takes as many as the prior was trained on; ``prompt`` is that of a
+    :class:`~agents.post_training.rollouts.PromptDeck`; ``workers`` may be ``"ray"``.
     """
 
     def __init__(
@@ -133,14 +124,9 @@ class Learner:
         return batch if self.algorithm.advantage is None else self.algorithm.advantage(batch)
 
     def begin_rewards(self, real: SceneBatch, *, first: bool) -> None:
-        """Give real scenes to the parts of the reward that learn (:class:`rewards.LearnedReward`), if any.
-
-        All processes train the same parts.
-
-        Args:
-            real: real scenes that training may see.
-            first: also train them on samples of the base prior, before they score the first batch; False for a run
-                whose state is restored.
+        """Give real scenes to the parts of the reward that learn (:class:`rewards.LearnedReward`), the same parts in
+        all processes. ``first`` also trains them on samples of the base prior; it is False if the run's state is
+        restored.
         """
         seed = stream_seed(self.seed, "discriminator")
         for part in self.learned:
@@ -180,11 +166,8 @@ class Learner:
 
     def accumulate(self, batch: TensorDictBase, scenes: SceneBank, index: int) -> dict[str, float]:
         """Put the policy and regularisation gradients, summed over all processes, into ``.grad``; measure each one.
-
-        Args:
-            batch: whole episodes [B, S], with the advantages that the algorithm writes.
-            scenes: real scenes for the regularisation.
-            index: number of the update in the run, from which the draws of steps and real scenes follow.
+        ``batch`` has whole episodes [B, S] with advantages; the draws of steps and real scenes follow from ``index``,
+        the number of the update.
         """
         self.optimizer.zero_grad(set_to_none=True)
         policy = self.algorithm.accumulate(batch, self._generator("steps", index))
@@ -198,11 +181,7 @@ class Learner:
         return {"policy_loss": policy.loss, "policy_gradient_norm": policy_norm, **row, **policy.columns}
 
     def update(self, batch: TensorDictBase, scenes: SceneBank, index: int) -> dict[str, float]:
-        """One optimiser step.
-
-        Raises:
-            NonFiniteGradient: the gradient is not finite; the weights in training are unchanged.
-        """
+        """One optimiser step; a NonFiniteGradient leaves the weights in training unchanged."""
         row = self.accumulate(batch, scenes, index)
         row["gradient_norm"] = float(nn.utils.clip_grad_norm_(self.parameters, MAX_GRADIENT_NORM))
         if not all(math.isfinite(row[name]) for name in ("gradient_norm", "policy_loss", "pretraining_loss")):
@@ -249,11 +228,8 @@ class Learner:
 
 
 class WholeBatchReward:
-    """A reward that depends on the other scenes of a batch, for which each process scores the scenes of all processes.
-
-    Args:
-        reward: resolved reward.
-        processes: processes that call this reward together, each with the same number of scenes.
+    """A resolved reward that depends on the other scenes of a batch: each of ``processes``, which call it together with
+    equally many scenes, scores the scenes of all.
     """
 
     depends_on_batch = True

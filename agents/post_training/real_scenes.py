@@ -28,15 +28,10 @@ _AT_ONCE = 64
 
 @dataclass(frozen=True)
 class PromptedScenes:
-    """Normalised scenes and one prompt for each.
+    """Normalised scenes and one prompt for each."""
 
-    Attributes:
-        scenes: (M, N, D) normalised scenes.
-        prompts: one prompt per scene, ``""`` for a scene without one; None for a prior that reads no prompts.
-    """
-
-    scenes: Tensor
-    prompts: Sequence[str] | None
+    scenes: Tensor  # (M, N, D)
+    prompts: Sequence[str] | None  # ``""`` for a scene without one; None for a prior that reads no prompts
 
     def batch(self, count: int, generator: Generator) -> PromptedScenes:
         """``count`` scenes and their prompts, drawn with replacement."""
@@ -47,19 +42,12 @@ class PromptedScenes:
 
 @dataclass(frozen=True)
 class SceneBank:
-    """Normalised real scenes, in a fixed split into training scenes and held-out scenes.
+    """Normalised real scenes, in a fixed split into training scenes and held-out scenes."""
 
-    Attributes:
-        train: (M, N, D) scenes for the regularisation.
-        heldout: (K, N, D) scenes for the guard.
-        prompts: all prompts of a scene by its index, with held-out scenes after training scenes; None without prompts.
-        base: samples of the base prior; None for none.
-    """
-
-    train: Tensor
-    heldout: Tensor
-    prompts: PromptSets | None = None
-    base: PromptedScenes | None = None
+    train: Tensor  # (M, N, D), for the regularisation
+    heldout: Tensor  # (K, N, D), for the guard
+    prompts: PromptSets | None = None  # all prompts of a scene by its index, held-out scenes after training scenes
+    base: PromptedScenes | None = None  # samples of the base prior
 
     @classmethod
     def split(cls, x0: Tensor, heldout: int, prompts: PromptSets | None = None) -> SceneBank:
@@ -69,9 +57,8 @@ class SceneBank:
         return cls(x0[:-heldout], x0[-heldout:], prompts)
 
     def batch(self, count: int, generator: Generator) -> PromptedScenes:
-        """``count`` training scenes, drawn with replacement, each with one of its prompts.
-
-        As in pretraining, the prompt is withheld (``""``) from one scene in ten.
+        """``count`` training scenes, drawn with replacement, each with one of its prompts. As in pretraining, the
+        prompt is withheld (``""``) from one scene in ten.
         """
         index = torch.randint(len(self.train), (count,), generator=generator)
         texts = None
@@ -86,13 +73,9 @@ class SceneBank:
     def heldout_prompts(
         self, count: int | None = None, slots: int | None = None, scene_type: SceneType | None = None
     ) -> list[str] | None:
-        """One prompt of each held-out scene; kinds of prompts alternate from scene to scene; None without prompts.
-
-        Args:
-            count: number of scenes; None for all.
-            slots: largest number of objects that a prompt may ask for; ``""`` stands for a prompt that asks for more.
-                None allows any number.
-            scene_type: scene type of the scenes; only needed with ``slots``.
+        """One prompt of each held-out scene, or of the first ``count``; kinds of prompts alternate. None without
+        prompts. ``""`` replaces a prompt for more than ``slots`` objects of ``scene_type``; ``slots`` None allows any
+        number.
         """
         if self.prompts is None:
             return None
@@ -114,7 +97,6 @@ def kept_scenes(
     progress: str = "none",
 ) -> SceneBatch:
     """The real scenes of a run, kept in its folder with the prompts of a dataset; the first process draws them.
-
     ``reuse`` loads those that are already in the folder, as a resumed run does.
     """
     path, texts, processes = directory / SCENES_NAME, directory / PROMPTS_NAME, ProcessGroup.current()
@@ -132,16 +114,10 @@ def kept_scenes(
 def real_scenes(
     prior: ScenePrior, source: str, count: int, *, seed: int, slots: int | None = None, progress: str = "none"
 ) -> tuple[SceneBatch, list[tuple[str, ...]] | None]:
-    """``count`` real scenes of the prior's scene type, and the prompts of each if they have any.
-
-    Args:
-        prior: prior of the wanted scene type.
-        source: ``"grammar"``, or the directory of a dataset.
-        count: number of scenes; a smaller dataset gives all it has.
-        seed: seed of the grammar, or of the choice of rows.
-        slots: smallest number of slots per scene; None takes as many as the prior was trained on. Real scenes keep all
-            their slots, because a prior reads any number of slots.
-        progress: a style of :class:`~scene_envs.progress.Progress`.
+    """``count`` scenes of the prior's type from ``"grammar"`` or a dataset folder (all it has, if fewer), and the
+    prompts of each if they have any. ``seed`` is that of the grammar, or of the choice of rows. ``slots`` is the
+    smallest number per scene (None: as in training); scenes keep all their slots, because a prior reads any number of
+    slots.
     """
     slots = max(prior.scene_type.slots, prior.config.slots if slots is None else slots)
     if source == "grammar":
@@ -176,10 +152,8 @@ def kept_base_samples(
     reuse: bool,
     progress: str = "none",
 ) -> PromptedScenes:
-    """The base prior's samples of a run, kept in its folder; the first process draws them.
-
-    The samples have the prompts of real scenes, so that prompts do not distinguish samples from real scenes.
-    ``reuse`` loads those that are already in the folder, as a resumed run does.
+    """The base prior's samples of a run, kept in its folder; the first process draws them, or ``reuse`` loads them.
+    They have the prompts of real scenes, so that prompts do not distinguish samples from real scenes.
     """
     path, processes = directory / BASE_SAMPLES_NAME, ProcessGroup.current()
     prompts = bank.batch(count, Generator().manual_seed(stream_seed(seed, "base_prompts"))).prompts

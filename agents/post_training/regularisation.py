@@ -44,11 +44,8 @@ SceneLoss = Callable[[NoisedScenes, Text | None], Tensor]
 
 
 class Regularisation:
-    """The loss that keeps a prior in training near real scenes, and its weight.
-
-    Args:
-        settings: settings of the regularisation.
-        prior: the base prior; it is copied if it is needed.
+    """The loss that keeps a prior in training near real scenes, and its weight; the base ``prior`` is copied if
+    needed.
     """
 
     def __init__(self, settings: RegularisationSettings, prior: ScenePrior) -> None:
@@ -71,16 +68,9 @@ class Regularisation:
         generator: Generator,
         chunk: int | None,
     ) -> dict[str, float]:
-        """Add the gradient of the loss on real scenes, and on samples of the base prior; returns columns of the log.
-
-        Real scenes and samples get the same timesteps and noise.
-
-        Args:
-            prior: prior in training.
-            real: real scenes of all processes.
-            base: an equal number of samples of the base prior; None for any loss but the discriminative one.
-            generator: source of timesteps and noise (CPU).
-            chunk: number of scenes per pass.
+        """Add the gradient of the loss on ``real`` scenes of all processes, and on equally many ``base`` samples
+        (discriminative loss only); returns columns of the log. Both get the same timesteps and noise from ``generator``
+        (CPU). ``chunk`` is the number of scenes per pass.
         """
 
         def add(scenes: PromptedScenes, generator: Generator, loss: SceneLoss | None) -> tuple[float, float]:
@@ -114,10 +104,8 @@ class Regularisation:
             logger.warning("%s", self.verdict())
 
     def return_to_checkpoint(self, ratio: float) -> None:
-        """Keep the weight, and forget how the held-out loss changed before a return to an earlier checkpoint.
-
-        Args:
-            ratio: held-out loss of this checkpoint, as a ratio to the base prior's.
+        """Keep the weight, and forget how the held-out loss changed before a return to a checkpoint, whose held-out
+        loss is ``ratio`` times the base prior's.
         """
         self.state = self.state.returned(ratio)
 
@@ -171,19 +159,10 @@ def add_regularisation_gradient(
     chunk: int | None = None,
     prompts: Sequence[str] | None = None,
 ) -> tuple[float, float]:
-    """Add ``coefficient`` times the gradient of a loss of noised scenes to ``.grad``.
-
-    Args:
-        prior: the prior in training.
-        x0: (B, N, D) normalised scenes of all processes; each process takes its share of them.
-        coefficient: coefficient of the loss, which is a mean over scenes and entries.
-        generator: source of timesteps and noise (CPU).
-        loss: (B,) losses of noised scenes; None for the pretraining loss.
-        chunk: number of scenes per pass.
-        prompts: one prompt per scene, ``""`` for a scene without one; None for a prior that reads no prompts.
-
-    Returns:
-        The mean loss of all scenes, and the norm of ``coefficient`` times its gradient.
+    """Add ``coefficient`` times the gradient of the mean (B,) ``loss`` of noised scenes (None: pretraining loss) to
+    ``.grad``. ``x0`` (B, N, D) are normalised scenes of all processes, of which each takes its share; ``generator`` is
+    on the CPU; a scene without a prompt has ``""``. Returns the mean loss of all scenes, and the norm of the scaled
+    gradient.
     """
     if coefficient == 0:
         return 0.0, 0.0
@@ -214,23 +193,13 @@ def add_regularisation_gradient(
 
 @dataclass(frozen=True)
 class DiscriminativeLoss:
-    """Direct discriminative optimisation (Zheng et al. 2025, arXiv 2503.01103) of a diffusion prior.
-
-    The log-likelihood ratio of the prior and its base is the logit of a discriminator of real scenes and samples of the
-    base prior, which is trained with the logistic loss. The odds of the best discriminator are the density of real
-    scenes divided by that of base samples, so the best prior has the density of real scenes. The pretraining loss l of
-    a noised scene takes the place of -log p. With the gap d = l(base) - l(prior), the losses are
-
-        (2 / s) softplus(-s d) of real scenes,    (2 / s) softplus(s d) of base samples
-
-    At the base prior, their gradients are those of l and of -l. The gradient of a real scene vanishes where s d is
-    large, and that of a base sample where -s d is large. So no sample repels without bound. Where base samples are like
-    real scenes, the two gradients cancel in the mean.
-
-    Attributes:
-        prior: prior in training.
-        base: base prior, with which the prior is compared; its weights get no gradient.
-        sharpness: factor s, per unit of the pretraining loss; near 0 the loss of base samples has no bound.
+    """Direct discriminative optimisation (Zheng et al. 2025, arXiv 2503.01103) of a diffusion prior. The log-likelihood
+    ratio of prior and base is the logit of a discriminator of real scenes and base samples; at its best, the prior has
+    the density of real scenes. The pretraining loss l of a noised scene takes the place of -log p. With d = l(base) -
+    l(prior), the losses are (2 / s) softplus(-s d) of real scenes and (2 / s) softplus(s d) of base samples. At the
+    base prior, their gradients are those of l and of -l, which cancel in the mean where base samples are like real
+    scenes. The gradient of a real scene vanishes where s d is large, that of a base sample where -s d is, so no sample
+    repels without bound.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed")
@@ -241,8 +210,8 @@ class DiscriminativeLoss:
     """
 
     prior: ScenePrior
-    base: ScenePrior
-    sharpness: float
+    base: ScenePrior  # its weights get no gradient
+    sharpness: float  # s, per unit of the pretraining loss; near 0 the loss of base samples has no bound
 
     def of_real(self, noised: NoisedScenes, text: Text | None = None) -> Tensor:
         """(B,) losses of noised real scenes."""
@@ -267,23 +236,14 @@ def relative_error(target: float, measured: float) -> float:
 
 @dataclass(frozen=True)
 class HoldState:
-    """State of the controller; plain numbers, for checkpoints.
+    """State of the controller; plain numbers, for checkpoints."""
 
-    Attributes:
-        log_factor: logarithm of the factor on the weight of the regularisation.
-        iteration: iteration of the last measurement.
-        measured: last measured ratio; None before the first measurement.
-        slope: change of the ratio per iteration, averaged.
-        beyond: number of measurements in a row above the target with the factor at its upper bound.
-        lost_at: iteration from which the target counts as not held; None while it counts as held.
-    """
-
-    log_factor: float = 0.0
-    iteration: int = 0
-    measured: float | None = None
-    slope: float = 0.0
-    beyond: int = 0
-    lost_at: int | None = None
+    log_factor: float = 0.0  # of the factor on the weight of the regularisation
+    iteration: int = 0  # of the last measurement
+    measured: float | None = None  # last measured ratio
+    slope: float = 0.0  # change of the ratio per iteration, averaged
+    beyond: int = 0  # measurements in a row above the target with the factor at its upper bound
+    lost_at: int | None = None  # iteration from which the target counts as not held; None while it counts as held
 
     @property
     def factor(self) -> float:
@@ -296,17 +256,10 @@ class HoldState:
 
 
 def adjust(state: HoldState, target: float, measured: float, iteration: int) -> HoldState:
-    """The state after a measurement: integral control of the factor's logarithm, within bounds.
-
-    It is the controller of Ziegler et al. (2019, Eq. 4) with two changes. The gain is per iteration, so that checks
-    may come at any distance. The figure is extrapolated by ``LOOK_AHEAD`` iterations with its averaged change per
-    iteration. The error is bounded; an error that is not a number counts as the largest.
-
-    Args:
-        state: state before the measurement.
-        target: ratio that is held.
-        measured: ratio of the held-out loss to the base prior's now.
-        iteration: number of the finished iteration.
+    """The state after the held-out loss was ``measured`` as a ratio to the base prior's, of which ``target`` is held:
+    integral control of the factor's logarithm, within bounds (Ziegler et al. 2019, Eq. 4). Unlike there, the gain is
+    per iteration, so that checks may come at any distance, and the ratio is extrapolated by ``LOOK_AHEAD`` iterations
+    with its averaged change. The error is bounded; one that is not a number counts as the largest.
 
     >>> state = adjust(HoldState(), 1.05, measured=1.1, iteration=1)
     >>> round(state.factor, 3)

@@ -132,13 +132,8 @@ def post_train_and_compare(
 
 
 def load_learned_rewards(reward: Any, directory: Path, heldout: int, seed: int) -> None:
-    """Give the parts of ``reward`` that learn their state at the end of a run.
-
-    Args:
-        reward: resolved reward.
-        directory: folder of the run.
-        heldout: number of real scenes that the guard held out.
-        seed: seed of the run.
+    """Give the parts of a resolved ``reward`` that learn their state at the end of the run in ``directory``, whose
+    guard held out ``heldout`` real scenes.
     """
     if parts := learned_parts(reward):
         real = SceneBatch.load(directory / SCENES_NAME)
@@ -181,24 +176,16 @@ def _write_comparison(
 
 @dataclass(frozen=True)
 class Measured:
-    """Fresh samples of a prior and their measured figures.
-
-    Attributes:
-        figures: ``objects`` (mean count, welded included), ``objects_sem`` (its standard error), ``feasible_objects``
-            (free, raw), ``feasible_fraction`` of free objects, ``ready_objects`` (free, after projection and
-            settling, feasible and in the workspace), ``ready_objects_sem``, ``ready_fraction``, ``scenes``,
-            ``reward`` (mean of the trained reward), ``reward_sem``, ``reward_invalid`` (scenes it could not score),
-            ``prompt_match`` (with prompts: the reward of that name), ``prompt_match_sem``,
-            ``invalid_scenes`` (physics failed: left out of feasible and ready figures), and the cheap realism figures.
-        raw: raw samples.
-        ready: the samples after projection and settling.
-        is_ready: (B, N) bool, simulation-ready objects of ``ready``.
+    """Fresh samples of a prior and their figures. ``objects`` are all, welded included; ``feasible_*`` figures count
+    raw free objects, and ``ready_*`` free objects that are feasible and in the workspace after projection and settling.
+    Both leave out ``invalid_scenes``, where physics failed. ``reward`` is the trained one, ``reward_invalid`` counts
+    scenes that it could not score, ``prompt_match`` is the reward of that name, and ``*_sem`` are standard errors.
     """
 
     figures: dict[str, float]
-    raw: SceneBatch
-    ready: SceneBatch
-    is_ready: Tensor
+    raw: SceneBatch  # raw samples
+    ready: SceneBatch  # the samples after projection and settling
+    is_ready: Tensor  # (B, N) bool, simulation-ready objects of ``ready``
 
 
 def measure_prior(
@@ -214,19 +201,9 @@ def measure_prior(
     slots: int | None = None,
     reward: Any = None,
 ) -> Measured:
-    """Sample ``count`` scenes and measure all of them.
-
-    Args:
-        prior: prior to measure.
-        count: number of scenes.
-        num_steps: denoiser evaluations per scene.
-        seed: seed of the samples; the same seed for two priors starts both from the same noise.
-        pool: physics workers.
-        prompts: one prompt per scene, with which the samples are compared; None for none.
-        guidance: weight of classifier-free guidance.
-        claim_guidance: strength of claim guidance.
-        slots: slots per sample; None takes as many as the prior was trained on.
-        reward: reward that the run trains with, as :func:`rewards.process.run_reward` gives it; None measures none.
+    """Sample ``count`` scenes of ``num_steps`` denoiser evaluations and measure all of them. The same ``seed`` for two
+    priors starts both from the same noise. ``prompts`` has one per scene; ``slots`` None takes as many as the prior was
+    trained on; ``reward`` is that of the run, from :func:`rewards.process.run_reward`.
     """
     from scene_envs.physics import feasibility, make_ready
 
@@ -279,24 +256,16 @@ def _standard_error(values: Tensor) -> float:
 
 
 def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) -> Path:
-    """Draw the first scenes of ``batch`` with their counts as a PNG.
-
-    Args:
-        batch: scenes to draw.
-        path: image file to write.
-        is_ready: (B, N) bool; if given, captions count these objects, and the other free objects are red.
+    """Draw the first scenes of ``batch`` with their counts as a PNG; with ``is_ready`` (B, N), captions count these
+    objects, and the other free objects are red.
     """
     images, captions = _drawn(batch, is_ready, _GALLERY)
     return _save_gallery(images, captions, path)
 
 
 def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bool = False) -> Path:
-    """Draw the first scenes of several priors as a PNG: a row per scene, a column per prior.
-
-    Args:
-        measured: samples of each prior from the same noise, by the name in the captions; three fit the page.
-        path: image file to write.
-        ready: whether to show the scenes after projection and settling, with objects that are not ready in red.
+    """Draw the first scenes of up to three priors, by caption and from the same noise, as a PNG: a row per scene, a
+    column per prior. ``ready`` shows them after projection and settling, with objects that are not ready in red.
     """
     drawn = [
         _drawn(part.ready if ready else part.raw, part.is_ready if ready else None, _GALLERY // 2)

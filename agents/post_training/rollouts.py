@@ -208,13 +208,8 @@ PromptSets = Callable[[int], Sequence[str]]
 
 
 class PromptDeck:
-    """Deck from which the prompts of batches are dealt.
-
-    Args:
-        prompt: one text, a list, ``"data"`` (the prompts of real scenes) or ``"grammar"``.
-        share: number of scenes of a batch that share a prompt, so that they can be compared.
-        real: prompts of real scenes by index, for ``"data"``.
-        count: number of real scenes.
+    """Deck that deals the prompts of batches: one text, a list, ``"data"`` (those of ``count`` real scenes, in ``real``
+    by index) or ``"grammar"``. ``share`` scenes of a batch have the same prompt, so that they can be compared.
 
     >>> deck = PromptDeck(["A scene with two cups.", "A scene with a teapot."], share=2)
     >>> dealt = deck.deal(4, Generator().manual_seed(0))
@@ -256,9 +251,8 @@ class PromptDeck:
 
 
 def run_prompts(directory: Path, batch: SceneBatch, seed: int) -> PromptSets:
-    """The prompts of a run's real scenes: those kept in the run's folder, or else descriptions of the scenes.
-
-    Descriptions are written on first use; those of scene i depend only on ``seed`` and on i.
+    """The prompts of a run's real scenes: those kept in the run's folder, or else descriptions of the scenes, written
+    on first use. Those of scene i depend only on ``seed`` and on i.
     """
     path = directory / PROMPTS_NAME
     if path.exists():

@@ -26,11 +26,7 @@ BASE_SAMPLES_NAME = "base_samples.safetensors"
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace ``path`` atomically.
-
-    Raises:
-        TrainingError: the file could not be written; a file that was there before is unchanged.
-    """
+    """Replace ``path`` atomically; a TrainingError leaves a file that was there before unchanged."""
     writing(repr(str(path)), lambda: files.write_text(path, text))
 
 
@@ -59,11 +55,8 @@ def write_log(directory: Path, history: Sequence[Mapping[str, float]]) -> None:
 
 
 def load_resumable(directory: Path, config: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The checkpoint of an interrupted run of the same configuration, given as plain values; None without one.
-
-    Raises:
-        CorruptFileError: the checkpoint is truncated.
-        InvalidInputError: the directory holds a run of another configuration.
+    """The checkpoint of an interrupted run of the same configuration, as plain values; None without one. A
+    CorruptFileError if it is truncated, an InvalidInputError if the directory holds a run of another configuration.
     """
     path = directory / CHECKPOINT_NAME
     if not path.exists():
@@ -99,15 +92,9 @@ def draw_curve(
     beyond: int | None = None,
     highest: float | None = None,
 ) -> Path:
-    """Draw reward and guard over iterations as a PNG; diamonds are the rewards of the guard's samples.
-
-    Args:
-        history: rows with ``iteration``, ``reward``, ``reward_std`` and, at checks, ``guard_ratio``.
-        path: image file to write.
-        reward_name: label of the upper axis.
-        limit: limit of the guard's loss, drawn as a line.
-        beyond: iteration from which the run is over-optimised; the picture is shaded from there.
-        highest: largest possible reward, which bounds the band of the standard deviation; None for no bound.
+    """Draw reward and guard over iterations as a PNG. ``history`` has ``iteration``, ``reward``, ``reward_std`` and, at
+    checks, ``guard_ratio``, whose ``limit`` is a line; diamonds are rewards of the guard's samples. The picture is
+    shaded from iteration ``beyond`` (over-optimised); ``highest`` bounds the band of the standard deviation.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -159,16 +146,9 @@ def _smooth(values: np.ndarray, half: int = 4) -> np.ndarray:
 
 @contextmanager
 def run_progress(title: str, total: int, style: str, done: int = 0) -> Iterator[Callable[[int, float, float], None]]:
-    """Show the progress of a run; yields the function that advances it.
-
-    The function takes the number of iterations done, the mean reward of the last batch, and the held-out loss divided
-    by that of the base prior. Lines are printed after the first iteration, every 5 s and at the end.
-
-    Args:
-        title: name of the run.
-        total: number of iterations.
-        style: ``"bar"`` (lines when stderr is no terminal), ``"lines"`` or ``"none"``.
-        done: number of iterations before the run was resumed.
+    """Show the progress of a run; yields the function that advances it, which takes the number of iterations done, the
+    last batch's mean reward, and the held-out loss divided by the base prior's. ``style`` is ``"bar"`` (lines when
+    stderr is no terminal), ``"lines"`` (after the first iteration, every 5 s and at the end) or ``"none"``.
     """
     with Progress(title, total, done=done, style=style, every=5.0, always=(done + 1, total)) as progress:
 

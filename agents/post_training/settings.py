@@ -272,11 +272,7 @@ def list_algorithms() -> list[str]:
 
 
 def algorithm_settings(name: str) -> type[AlgorithmSettings]:
-    """The dataclass of an algorithm's keys.
-
-    Raises:
-        UnknownNameError: no algorithm has that name; the nearest known one is offered.
-    """
+    """The dataclass of an algorithm's keys; an UnknownNameError offers the nearest known name."""
     return _ALGORITHMS[name].settings
 
 
@@ -290,10 +286,8 @@ def make_algorithm(settings: AlgorithmSettings, policy: Any, stds: Any) -> Any:
 
 
 def held_ratio(text: str) -> float:
-    """Ratio of the held-out loss to the base prior's that a text ``guard:RATIO`` names.
-
-    Raises:
-        InvalidInputError: the text has another form, or the ratio is not above 1.
+    """Ratio of the held-out loss to the base prior's that a text ``guard:RATIO`` names; an InvalidInputError for
+    another form, or a ratio that is not above 1.
 
     >>> held_ratio("guard:1.05")
     1.05

@@ -236,12 +236,9 @@ class PostTrainer:
         self.guard = self._make_guard()
 
     def _try_reward(self, real: SceneBatch, prompts: PromptSets | None) -> None:
-        """Score real scenes as the scenes of the run will be scored.
-
-        Real scenes are scored with their own prompts if the run uses the prompts of real scenes; more scenes are then
-        tried, each with all of its prompts, because a reward may read only one kind of prompt. Otherwise they are
-        scored with the prompts of the run, with which it may be that no real scene can be scored; such a run is not
-        refused.
+        """Score real scenes as the scenes of the run will be. If the run uses prompts of real scenes, more scenes are
+        tried, each with all of its prompts, because a reward may read only one kind. With other prompts it may be that
+        no real scene can be scored; such a run is not refused.
         """
         config, learner, scene_type = self.config, self.learner, self.prior.scene_type
         if config.guard.limits.stack is not None and not scene_type.has_geometry:

@@ -52,9 +52,8 @@ _HELD_OUT = 512
 
 
 def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
-    """The prior that a run starts from, its training scenes, and held-out scenes (K, N, D).
-
-    A run from an older prior takes the scene type of its data; if a grammar makes the data, it takes that of the prior.
+    """The prior that a run starts from, its training scenes, and held-out scenes (K, N, D). A run from an older prior
+    takes the scene type of its data; if a grammar makes the data, it takes that of the prior.
     """
     older = PriorFacts.of(config.prior) if config.prior else None
     if older is not None and config.text.is_read and not older.text:
@@ -141,9 +140,8 @@ def _prepare_union(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Te
 def build_prior(
     config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]] = ()
 ) -> ScenePrior:
-    """The prior that ``config`` starts from: an older one, or a fresh one, fitted to ``raw`` scenes (M, N, D).
-
-    The ``prompts`` of every scene are the source of the vocabulary of a fresh prior that reads prompts.
+    """The prior that ``config`` starts from: an older one, or a fresh one, fitted to ``raw`` scenes (M, N, D). A fresh
+    prior that reads prompts has the vocabulary of the ``prompts`` of every scene.
     """
     if config.prior:
         return _started(config, raw, prompts)
@@ -153,9 +151,8 @@ def build_prior(
 
 
 def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str]]) -> ScenePrior:
-    """The prior that ``config`` names, for raw scenes (M, N, D) of its type; a warning lists words that it lacks.
-
-    It keeps its normaliser, vocabulary and settings, except for ``open_empty_share``, which is that of ``config``.
+    """The prior that ``config`` names, for raw scenes (M, N, D) of its type; a warning lists words that it lacks. It
+    keeps its normaliser, vocabulary and settings, except for ``open_empty_share``, which is that of ``config``.
     """
     slots = raw.shape[1]
     prior = ScenePrior.load(config.prior)

@@ -36,11 +36,10 @@ def learning_rate_at(step: int, config: PretrainConfig) -> float:
 def build_optimizer(
     name: str, network: nn.Module, weight_decay: float, text_rate: float = 1.0
 ) -> torch.optim.Optimizer:
-    """An optimiser of ``network``; ``rate`` of a parameter group is its share of the learning rate.
-
-    ``"muon"`` is Muon on the matrices inside ``blocks`` and AdamW on the rest. ``text_rate`` is the ``rate`` of the
-    parameters under ``text_encoder``: at first, only a few percent of the loss depend on prompts, and with the full
-    learning rate all words get the same embedding before the network reads them.
+    """An optimiser of ``network``; ``rate`` of a parameter group is its share of the learning rate. ``"muon"`` is Muon
+    on matrices inside ``blocks`` and AdamW on the rest. ``text_rate`` is the ``rate`` under ``text_encoder``: few
+    percent of the loss depend on prompts at first, and at the full rate all words get the same embedding before they
+    are read.
     """
     if name not in OPTIMIZERS:
         raise unknown_name("optimizer", name, OPTIMIZERS)
@@ -62,11 +61,9 @@ def build_optimizer(
 
 
 class MuonAdamW(torch.optim.Optimizer):
-    """Muon (Jordan et al. 2024) on matrices and AdamW on everything else, under one learning rate.
-
-    The update of a matrix is its momentum made orthogonal, scaled so that its root mean square is that of an AdamW
-    update (Liu et al. 2025). It is computed in float32, because ``torch.optim.Muon`` iterates in bfloat16, which is
-    very slow on most CPUs. The weight decay is decoupled.
+    """Muon (Jordan et al. 2024) on matrices and AdamW on everything else, under one learning rate, with decoupled
+    weight decay. A matrix's update is its momentum made orthogonal, scaled to the root mean square of an AdamW update
+    (Liu et al. 2025), in float32, because ``torch.optim.Muon`` iterates in bfloat16, which is very slow on most CPUs.
 
     >>> weight = nn.Parameter(torch.eye(2))
     >>> optimizer = MuonAdamW([weight], [], lr=0.1, weight_decay=0.0)

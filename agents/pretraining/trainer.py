@@ -384,14 +384,10 @@ def pretrain(config: PretrainConfig) -> dict[str, Any]:
 
 
 def warm_up_text(prior: ScenePrior, data: TrainingData, steps: int, batch_size: int, seed: int) -> float | None:
-    """Train the text encoder, and the layers that predict numbers from it, only on prompts and counts of their scenes.
-
-    No scene is denoised, so hundreds of such steps take a minute. The run that follows starts with predicted numbers,
-    from which the network can subtract the visible objects. The prior is changed in place, if it has count
-    conditioning. The same seed gives the same weights.
-
-    Returns:
-        Mean loss of the last tenth of the steps, in nats per kind of object; None if nothing was trained.
+    """Train the text encoder, and the layers that predict numbers from it, in place on prompts and counts of their
+    scenes only, if the prior has count conditioning. No scene is denoised, so hundreds of steps take a minute; the run
+    then starts with predicted numbers. The same seed gives the same weights. Returns the mean loss of the last tenth of
+    the steps, nats per kind of object; None if nothing was trained.
     """
     conditioning = prior.count_conditioning
     if conditioning is None or steps < 1:

@@ -20,10 +20,8 @@ _TRAILER = len(_MARK) + 64
 
 
 def save_checkpoint(path: str | os.PathLike[str], state: dict[str, Any]) -> None:
-    """Write ``state`` (tensors, numbers, strings, containers) to ``path``, replacing it atomically.
-
-    Raises:
-        TrainingError: the file could not be written; the previous checkpoint is untouched.
+    """Write ``state`` (tensors, numbers, strings, containers) to ``path``, replacing it atomically; a TrainingError
+    leaves the previous checkpoint untouched.
     """
     try:
         with replacing(path) as partial, partial.open("w+b") as file:
@@ -43,10 +41,8 @@ def save_checkpoint(path: str | os.PathLike[str], state: dict[str, Any]) -> None
 
 
 def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a checkpoint, weights only: no code in the file is run.
-
-    Raises:
-        CorruptFileError: truncated, damaged, or not a checkpoint.
+    """Read a checkpoint, weights only: no code in the file is run. A CorruptFileError if it is truncated, damaged, or
+    no checkpoint.
     """
     try:
         with open(path, "rb") as file:

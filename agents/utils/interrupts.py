@@ -22,10 +22,9 @@ class Terminated(KeyboardInterrupt):
 
 @contextmanager
 def terminable(received: list[int] | None = None) -> Iterator[None]:
-    """Context in which SIGTERM raises :class:`Terminated`; outside the main thread it changes nothing.
-
-    The number of each such signal is appended to ``received``. Compiled code, such as the import of an extension
-    module, may turn the exception into another error; the list then shows that a signal came.
+    """Context in which SIGTERM raises :class:`Terminated`; outside the main thread it changes nothing. Each signal's
+    number is appended to ``received``, which shows it where compiled code, such as the import of an extension module,
+    turns the exception into another error.
     """
 
     def note_and_raise(number: int, frame: FrameType | None) -> None:
@@ -39,9 +38,8 @@ def terminable(received: list[int] | None = None) -> Iterator[None]:
 
 @contextmanager
 def finishing_steps() -> Iterator[Ending]:
-    """Context in which SIGINT and SIGTERM wait for the end of a step, at most 15 s; a second one does not wait.
-
-    Yields an :class:`Ending`, to be called after each step. If a signal is ``pending``, save the state before the call.
+    """Context in which SIGINT and SIGTERM wait for the end of a step, at most 15 s; a second one does not wait. Yields
+    an :class:`Ending`, to be called after each step. If a signal is ``pending``, save the state before the call.
     """
     end = Ending()
     with _handling({signal.SIGINT: end.note, signal.SIGTERM: end.note, signal.SIGALRM: end.late}):

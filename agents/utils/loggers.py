@@ -72,11 +72,8 @@ class WandbRunLogger(RunLogger):
 
 
 def make_logger(name: str, folder: str | os.PathLike[str]) -> RunLogger:
-    """The logger ``name``, one of :data:`LOGGERS`, of the run in ``folder``.
-
-    Raises:
-        UnknownNameError: no such logger.
-        MissingDependencyError: the package of the logger is not installed.
+    """The logger ``name``, one of :data:`LOGGERS`, of the run in ``folder``; an UnknownNameError, or a
+    MissingDependencyError if its package is not installed.
     """
     if name not in LOGGERS:
         raise unknown_name("logger", name, LOGGERS)

@@ -28,35 +28,23 @@ TIMEOUT_SECONDS = 600.0
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """The processes of a run.
-
-    If a process ends or hangs, the others end too: the call in which they wait for it raises a
+    """The processes of a run. If one ends or hangs, the others end too: the call in which they wait for it raises a
     :class:`TrainingError`.
-
-    Attributes:
-        rank: index of this process.
-        size: number of processes; 1 without a launcher.
 
     >>> group = ProcessGroup(rank=1, size=2)
     >>> group.rows(6), group.is_first
     (slice(3, 6, None), False)
     """
 
-    rank: int = 0
-    size: int = 1
+    rank: int = 0  # index of this process
+    size: int = 1  # number of processes; 1 without a launcher
 
     @classmethod
     def join(cls, device: str = "cpu", timeout: float = TIMEOUT_SECONDS) -> ProcessGroup:
-        """The group that the launcher set up, joined on first use; without a launcher, this process alone.
-
-        Args:
-            device: training device; each process of ``"cuda"`` takes a GPU of its own.
-            timeout: seconds that a process waits for the others.
-
-        Raises:
-            InvalidInputError: ``WORLD_SIZE`` is set, and the other variables of a launcher are not; or Accelerate was
-                asked for several processes on a CPU, of which it starts only one.
-            TrainingError: the other processes do not join.
+        """The group that the launcher set up, joined on first use; without a launcher, this process alone. Each process
+        of ``"cuda"`` takes a GPU of its own; ``timeout`` is in seconds. An InvalidInputError if only ``WORLD_SIZE`` of
+        a launcher's variables is set, or if Accelerate was asked for several processes on a CPU, of which it starts
+        only one; a TrainingError if the other processes do not join.
         """
         size = launched_processes()
         accelerate = os.environ.get("ACCELERATE_USE_CPU", "").lower() == "true" and "MASTER_ADDR" in os.environ

@@ -13,10 +13,8 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class WeightAverage:
-    """Exponential moving average of a module's parameters, with a final ``decay``.
-
-    After ``warm_up`` updates the decay is one half, unless the final decay is less; with 0 it is final from the first
-    on.
+    """Exponential moving average of a module's parameters. After ``warm_up`` updates the decay is one half, unless the
+    final ``decay`` is less; with 0 it is final from the first on.
 
     >>> layer = nn.Linear(1, 1)
     >>> average = WeightAverage(layer, decay=0.5)

@@ -26,14 +26,9 @@ from scene_envs.errors import InvalidInputError
 
 @dataclass(frozen=True)
 class BatchGradient:
-    """Statistics of the gradient that a batch added to ``.grad``.
+    """Statistics of the gradient that a batch added to ``.grad``: the loss, and further columns of the log."""
 
-    Attributes:
-        loss: value of the objective, over the scenes of all processes.
-        columns: further columns of the log.
-    """
-
-    loss: float
+    loss: float  # over the scenes of all processes
     columns: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -87,18 +82,9 @@ class Algorithm(ABC):
 
 
 class AveragedSampler(Algorithm):
-    """An algorithm that samples with a separate copy of the prior, whose weights are also evaluated and saved.
-
-    After each batch the copy moves towards the prior in training.
-
-    Args:
-        policy: policy that is optimised.
-        sampler_decay: final decay, per batch, of the weight average that samples.
-        warm_up: warm-up of the decay, see :class:`~agents.utils.weight_average.WeightAverage`.
-
-    Attributes:
-        prior: the prior in training.
-        sampler: the prior that samples.
+    """An algorithm that samples with ``sampler``, a copy of ``prior`` whose weights are also evaluated and saved. After
+    each batch it moves towards ``prior``; ``sampler_decay`` is the final decay per batch of this
+    :class:`~agents.utils.weight_average.WeightAverage`.
     """
 
     def __init__(self, policy: DenoisingPolicy, *, sampler_decay: float, warm_up: float = 10.0) -> None:
@@ -142,9 +128,8 @@ class AveragedSampler(Algorithm):
 
 
 class PlainLoss(LossModule):
-    """A torchrl loss whose gradient goes to the modules' own parameters, and which has no value estimator.
-
-    Its accepted keys have ``text`` and ``text_mask``.
+    """A torchrl loss whose gradient goes to the modules' own parameters, and which has no value estimator. Its accepted
+    keys have ``text`` and ``text_mask``.
     """
 
     tensor_keys: Any
@@ -173,12 +158,8 @@ class PlainLoss(LossModule):
 
 
 class GradientSum:
-    """Sum of the gradients of parts of a batch, each of which is complete before it is added.
-
-    The sum of two parts is the same, bit for bit, in one process as in two processes with one part each.
-
-    Args:
-        parameters: parameters whose ``.grad`` is summed; a gradient that is there already is the first part.
+    """Sum of the ``.grad`` of parts of a batch, each complete before it is added; a gradient that is there already is
+    the first part. The sum of two parts is the same, bit for bit, in one process as in two with one part each.
 
     >>> weight = nn.Parameter(torch.ones(1))
     >>> total = GradientSum([weight])
@@ -284,20 +265,11 @@ class Advantage(TensorDictModuleBase):
 
 
 class ForwardAdvantage(Advantage):
-    """Writes advantages that are not clipped, of poses and of categories.
-
-    Reads, in addition to the keys of :class:`Advantage`:
-        judged: (B, S, N) bool, optional. Slots that the reward does not judge have no advantage of their own: a table
-            of credit 0 would otherwise be repelled like an object that is not feasible.
-        counts_objects: (B, S, 1) bool, optional, whether the reward depends on which objects there are.
-
-    Writes, in addition:
-        category_advantage: (B, S, 1), the scene's advantage, or zeros for no credit.
-
-    Args:
-        credit: ``"scene"``, ``"object"`` or ``"auto"``, for poses.
-        category_credit: ``"scene"``, ``"none"``, or ``"auto"``: none where poses have credit per object and the reward
-            does not count objects.
+    """Writes advantages of poses that are not clipped, and ``category_advantage`` (B, S, 1): that of the scene, or
+    zeros for no credit. It also reads two optional keys. Slots outside ``judged`` (B, S, N) bool, which the reward does
+    not judge, have no advantage of their own: a table of credit 0 would otherwise be repelled like an object that is
+    not feasible. ``counts_objects`` (B, S, 1) bool says whether the reward depends on which objects there are; if not,
+    and if poses have credit per object, ``category_credit="auto"`` is ``"none"``, and otherwise ``"scene"``.
     """
 
     out_keys = ["advantage", "category_advantage", "valid"]  # noqa: RUF012
@@ -325,11 +297,7 @@ class ForwardAdvantage(Advantage):
 
 
 def last_steps(episodes: TensorDictBase) -> TensorDictBase:
-    """The last transitions [B] of whole episodes [B, S].
-
-    Raises:
-        InvalidInputError: a row is not one whole episode.
-    """
+    """The last transitions [B] of whole episodes [B, S]; an InvalidInputError if a row is not one whole episode."""
     done = episodes["next", "done"][..., 0]
     if done.ndim != 2 or not bool(done[:, -1].all()) or bool(done[:, :-1].any()):
         raise InvalidInputError(

@@ -236,16 +236,9 @@ def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[
 def accumulate_policy_gradient(
     loss: DDPOSFLoss, batch: TensorDictBase, steps: Sequence[int], *, scale: float = 1.0
 ) -> BatchGradient:
-    """Add the policy gradient of a batch to ``.grad``, one chunk of scenes and one step at a time.
-
-    The graph of a step is freed after the step, so memory does not depend on the number of steps. With several
-    processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
-
-    Args:
-        loss: the objective; its policy's ``chunk`` bounds the scenes per pass.
-        batch: whole episodes [B, S] with what the loss reads.
-        steps: indices of the steps in the gradient.
-        scale: factor on the sum over ``steps``.
+    """Add ``scale`` times the policy gradient of whole episodes [B, S], summed over ``steps``, to ``.grad``. It is
+    computed for one step, and for ``chunk`` scenes of the policy, at a time, so memory does not depend on the number of
+    steps. With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
     """
     total, largest, clipped = 0.0, 0.0, 0.0
     valid = batch["valid"][:, -1, 0]

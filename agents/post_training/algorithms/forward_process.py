@@ -276,17 +276,11 @@ class AWMLoss(ForwardProcessLoss):
 
 
 class Expectation(nn.Module):
-    """Mean target of a denoiser at a noised scene, over the scenes that the sampling policy makes.
-
-    A forward-process loss attracts the output to the targets of good samples, repels it from the targets of bad
-    samples, and takes the output of the sampling policy as the mean target. This output is not the mean, because a
-    policy in training is not an exact denoiser of its own samples. Where all samples are bad, the difference repels the
-    output, the sampling policy follows, and the difference grows. This copy of the denoiser learns the mean. Only the
-    covariance of target and advantage is then left, as in a policy gradient with an exact baseline.
-
-    Args:
-        prior: prior from which the denoiser is copied.
-        learning_rate: learning rate of AdamW.
+    """Copy of the denoiser that learns, with AdamW, the mean target at a noised scene over the sampling policy's
+    scenes. A forward-process loss otherwise takes the output of the sampling policy as this mean, which it is not,
+    because a policy in training is no exact denoiser of its own samples. Where all samples are bad, the difference
+    repels the output, the sampling policy follows, and the difference grows. With the learned mean, only the covariance
+    of target and advantage is left, as in a policy gradient with an exact baseline.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed")
