@@ -84,7 +84,7 @@ class Progress:
 
 
 def quiet_pybullet(otherwise: str) -> Any:
-    """The module pybullet, imported without the message that it prints; MissingDependencyError of text ``otherwise``."""
+    """The module pybullet, imported without its message; MissingDependencyError with the text ``otherwise``."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = os.dup(1), os.dup(2)

@@ -56,7 +56,7 @@ class Gripper:
             raise InvalidInputError(f"{self}: reaches {self.reaches} must not be longer than the fingers")
 
     def body(self) -> tuple[ConvexPart, ...]:
-        """The two fingers, and the palm with its path; x is the closing direction, z points back from the fingertips."""
+        """The two fingers, and the palm with its path; x is the closing direction, z points back from the tips."""
         aside = 0.5 * (self.opening + self.finger_thickness)
         finger = (self.finger_thickness, self.finger_width, self.finger_length)
         palm = (*self.palm, self.path)
