@@ -29,7 +29,7 @@ def _registries() -> list[dict[str, Any]]:
     from agents.post_training.settings import _ALGORITHMS
     from rewards.registry import _REWARDS
     from scene_envs.envs.masks import _MASKS
-    from scene_envs.export.api import _FORMATS
+    from scene_envs.export.formats import _FORMATS
     from scene_envs.grammars.grammar import GRAMMARS
     from scene_envs.scene_types import _SCENE_TYPES
 

@@ -12,6 +12,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.configuration.composition import dotted
 from agents.configuration.prior_names import CONFIG_NAME
 from agents.priors.files import PriorFacts, read_config, write_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
@@ -274,10 +275,10 @@ def _training_of(source: Path) -> dict[str, Any]:
     optimizer = config.get("optimizer") if isinstance(config, dict) else None
     if not isinstance(optimizer, dict):
         return {}
-    wanted = {"name": "optimizer", "lr": "learning_rate"} | {
-        key: key for key in ("ema", "warmup", "weight_decay", "precision")
-    }
-    trained = {name: optimizer[key] for key, name in wanted.items() if key in optimizer}
+    flat = dotted(optimizer)
+    names = {"rate.warmup": "warmup", "compute.precision": "precision"}
+    wanted = {"name": "optimizer", "lr": "learning_rate", "ema": "ema", **names}
+    trained = {name: flat[key] for key, name in wanted.items() if key in flat}
     return {"training": {**trained, "seed": config.get("seed")}}
 
 

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 from scene_envs.registry import lazy_names
 
 if TYPE_CHECKING:
-    from scene_envs.export.api import ExportFormat, ExportReport, export, list_formats, register_format
+    from scene_envs.export.api import ExportReport, export
+    from scene_envs.export.formats import ExportFormat, list_formats, register_format
     from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, place
 
 __all__ = [

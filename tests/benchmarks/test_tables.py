@@ -223,7 +223,9 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
 def tables(folders: tuple[str, str], output: Path, *words: str) -> int:
     data, heldout = folders
     base = [f"data={data}", f"heldout={heldout}", "tables=[objective]", f"rows=[{','.join(ROWS)}]", "size=tiny"]
-    return main([*base, "count=4", "workers=0", "pretraining={optimizer: {warmup: 2}}", f"output={output}", *words])
+    return main(
+        [*base, "count=4", "workers=0", "pretraining={optimizer: {rate: {warmup: 2}}}", f"output={output}", *words]
+    )
 
 
 def records(output: Path) -> list[dict[str, str]]:

@@ -62,7 +62,10 @@ def config_classes() -> dict[str, list[str]]:
 def test_configs_declare_a_dozen_fields_at_most() -> None:
     found = config_classes()
     assert len(found) > 60
-    whole = {"agents/networks/flux.py: MixedFluxConfig": 15}  # its keys stand in groups of a dozen on the command line
+    whole = {  # classes whose keys stand in groups, or in a JSON file
+        "agents/networks/flux.py: MixedFluxConfig": 15,
+        "scene_envs/assets/importing/build.py: AssetEntry": 13,
+    }
     assert {name: len(own) for name, own in found.items() if len(own) > 12} == whole
 
 

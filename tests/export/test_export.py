@@ -22,8 +22,7 @@ from agents.priors import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset
 from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
-from scene_envs.export import AssetFiles, export, list_formats, register_format
-from scene_envs.export import api as formats
+from scene_envs.export import AssetFiles, export, formats, list_formats, register_format
 from scene_envs.export.placed import (
     Palette,
     angle_axis,

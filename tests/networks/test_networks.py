@@ -339,7 +339,9 @@ def test_sizes_with_equal_parameters(name: str, process: str) -> None:
 
 @pytest.mark.slow
 def test_counts_agree_with_the_papers_size_and_with_a_sum_by_hand() -> None:
-    paper = {**vars(PretrainConfig(network="paper").network), "modules": ()}
+    network = vars(PretrainConfig(network="paper").network)
+    paper = {**network, **vars(network["flux"]), "modules": ()}
+    del paper["flux"]
     size = network_config(process="mixed", features=33, categories=21, text_width=768, **paper)
     assert parameter_count(size) == pytest.approx(88.3e6, rel=2e-3)
     distance = MixedFluxConfig(categories=8, hidden=16, heads=2, single_blocks=3, modules=(RelationsConfig(),))

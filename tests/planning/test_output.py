@@ -154,7 +154,8 @@ def test_the_page_of_thousands_of_scenes_is_small(tmp_path: Path) -> None:
     assert shown[:MAX_PATH_SCENES:MAX_PATH_SCENES] == path[1:2]
     assert shown[MAX_PATH_SCENES - 1] == path[-1]
     assert all(a < b for a, b in pairwise(shown[:MAX_PATH_SCENES]))
-    page = write_tree_page(tmp_path / "tree.html", record, dict.fromkeys(shown, search_scene()), metrics_of(record))
+    page = tmp_path / "tree.html"
+    write_tree_page(page, record, dict.fromkeys(shown, search_scene()), metrics_of(record))
     assert page.stat().st_size < 10_000_000
     record.save(tmp_path / "tree.json")
     assert (tmp_path / "tree.json").stat().st_size < 2_000_000
@@ -182,7 +183,8 @@ def test_a_browser_plays_the_path_and_shows_what_is_clicked(coarse_browser: Brow
     browser = coarse_browser
     record, _ = recorded(depth=3, width=3)
     scenes = dict.fromkeys(shown_nodes(record), search_scene())
-    path = write_tree_page(tmp_path / "tree.html", record, scenes, metrics_of(record), returned=search_scene())
+    path = tmp_path / "tree.html"
+    write_tree_page(path, record, scenes, metrics_of(record), returned=search_scene())
     assert "</script><b>" not in path.read_text()
     browser.send("Page.navigate", url=path.as_uri())
     inside = "document.getElementById('viewer')?.contentDocument?.body?.dataset"

@@ -50,7 +50,7 @@ class ExportConfig(DrawKeys):
 
 def check(settings: ExportConfig) -> None:
     """Refuse impossible settings before scenes are read."""
-    from scene_envs.export.api import check_formats
+    from scene_envs.export.formats import check_formats
 
     if bool(settings.scenes) == bool(settings.prior):
         raise InvalidInputError(
@@ -62,7 +62,7 @@ def check(settings: ExportConfig) -> None:
 
 def run(settings: ExportConfig, run: Run) -> None:
     """Read or draw the scenes and write them."""
-    from scene_envs.export.api import resolve_formats
+    from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 

@@ -46,7 +46,7 @@ class SampleConfig(SamplingKeys, DrawKeys, OutputKeys):
 
 def check(settings: SampleConfig) -> None:
     """Refuse impossible settings before a prior is loaded."""
-    from scene_envs.export.api import check_formats
+    from scene_envs.export.formats import check_formats
 
     require_one_of(settings, "union", ("one_type", "any"))
     if settings.export is not None:
@@ -57,7 +57,7 @@ def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.priors.guidance import physics_strength
     from rewards.process import close_reward, run_reward
-    from scene_envs.export.api import resolve_formats
+    from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 
