@@ -1,4 +1,4 @@
-"""The commands of ``scene-envs``, imported when they are called; one module each, but for what shares one.
+"""The commands of ``scene-envs``, imported when they are called: one module each; two that inpaint share one.
 
 A command module has ``run(settings, run)``, which does the work. The annotation of ``settings`` is a dataclass; its
 fields are the keys of the command, each with a sentence under ``Attributes:``. A module with ``WRITES = False`` has no
