@@ -47,7 +47,7 @@ class IsolatedReward:
         reward: a registered name, ``PATH.py:NAME`` or a mapping; objects cannot be sent.
         timeout: seconds that a call may take, and that making the reward may take.
         memory: GiB that it may allocate beyond what an empty worker needs (on Linux; elsewhere unlimited).
-        seed: of the run, for rewards that draw random numbers.
+        seed: seed of the run, for rewards that draw random numbers.
         workers: physics workers of a reward that asks for ``context.pool``; 0 computes in its process.
 
     Raises:

@@ -99,8 +99,8 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
     Args:
         kind: a dataclass, whose groups are dataclasses as well.
         tree: values by field name.
-        path: where ``tree`` stands, for messages, such as ``"optimizer."``.
-        command: whose keys these are, for messages.
+        path: place of ``tree`` in messages, such as ``"optimizer."``.
+        command: name of the command in messages.
 
     Raises:
         UnknownNameError: a key that ``kind`` does not have; the nearest one is offered.

@@ -178,7 +178,7 @@ class DenoisingCore:
         """(B,) numbers: step, timestep, objects, reward_valid and ``term_<name>`` for each term of the reward.
 
         Args:
-            result: of the step just taken; None after a reset.
+            result: result of the step just taken; None after a reset.
         """
         terms = result.terms if result is not None else dict.fromkeys(self.term_names)
         valid = np.ones(self.num_envs, np.int64) if result is None else result.valid.cpu().numpy().astype(np.int64)

@@ -126,7 +126,7 @@ def make_pool(workers: int | str, timeout: float = 60.0) -> PhysicsPool:
 
     Args:
         workers: number of processes, 0 for this one alone; ``"ray"`` for as many as the cluster has CPUs.
-        timeout: as for :class:`PhysicsPool`.
+        timeout: seconds for a chunk, as :class:`PhysicsPool` takes it.
 
     Raises:
         InvalidInputError: ``workers`` is neither a whole number nor ``"ray"``.
