@@ -24,7 +24,7 @@ SMALLER: dict[str, dict[str, str]] = {
         ),
         "post_train_and_compare(config)": "post_train_and_compare(config, scenes=1, num_steps=20)",
         "scenes, steps = 32, 25": "scenes, steps = 2, 3",
-        "40 * scenes": "2 * scenes",
+        "range(40)": "range(2)",
     },
     "docs/datasets.md": {
         "10_000,": "12,",
@@ -35,6 +35,7 @@ SMALLER: dict[str, dict[str, str]] = {
         'DenoisingTorchRLEnv(32, reward="object_count", num_steps=50)': (
             'DenoisingTorchRLEnv(2, reward="object_count", num_steps=3)'
         ),
+        "env.rollout(50, DenoisingPolicy(env.core.prior, 50))": "env.rollout(3, DenoisingPolicy(env.core.prior, 3))",
         'PPO("MultiInputPolicy", env).learn(1000)': (
             'PPO("MultiInputPolicy", env, n_steps=20, batch_size=10).learn(20)'
         ),
