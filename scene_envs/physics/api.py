@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
+from scene_envs.physics import EngineName
+from scene_envs.physics.engines import ITERATIONS, engine_name
 from scene_envs.physics.kernels import Chunk
-from scene_envs.physics.motion import ITERATIONS
 from scene_envs.physics.pool import PhysicsPool
 from scene_envs.rotations import geodesic_angle, project_to_so3
 from scene_envs.scene import SceneBatch, require_rigid_poses
@@ -26,8 +27,20 @@ Rows = list[dict[str, Any] | None]
 """Results of a kernel, one per scene."""
 
 
+def chosen_pool(pool: PhysicsPool | None, physics: EngineName | None) -> PhysicsPool:
+    """``pool``, else one that computes in this process with the engine ``physics``, or with that of ``auto``.
+
+    Raises InvalidInputError for a pool of another engine, and errors as :func:`~scene_envs.physics.engines.engine_name`.
+    """
+    if pool is None:
+        return PhysicsPool(workers=0, physics=physics or "auto")
+    if physics is not None and engine_name(physics) != pool.engine:
+        raise InvalidInputError(f"physics={physics!r}, but the pool computes with {pool.engine!r}: name one engine")
+    return pool
+
+
 def run_kernel(
-    kernel: str, batch: SceneBatch, options: dict[str, Any], pool: PhysicsPool | None, units: Tensor | None = None
+    kernel: str, batch: SceneBatch, options: dict[str, Any], pool: PhysicsPool, units: Tensor | None = None
 ) -> Rows:
     """Run a kernel of :data:`~scene_envs.physics.kernels.KERNELS`: results of each scene, None where it failed twice.
     ``units`` (B,) float64 may be spent by the simulation of each scene; None derives them from its objects.
@@ -37,12 +50,12 @@ def run_kernel(
     translations = batch.translations.double().cpu().numpy()
     rotations = batch.rotations.double().cpu().numpy()
     categories = batch.categories.cpu().numpy()
-    workers = max(1, pool.workers) if pool else 1
+    workers = max(1, pool.workers)
     size = max(1, min(_CHUNK, -(-len(batch) // workers)))
     limits = None if units is None else units.double().cpu().numpy()
     whole = Chunk(batch.scene_type, translations, rotations, categories, limits)
     chunks = [whole[start : start + size] for start in range(0, len(batch), size)]
-    results = (pool or PhysicsPool(workers=0)).run(kernel, chunks, options)
+    results = pool.run(kernel, chunks, options)
     if lost := sum(row is not None and not row["valid"] for row in results):
         _LOGGER.debug(
             "%s: %d of %d scenes are invalid: too deep in each other to be simulated or measured, or the simulation "
@@ -247,6 +260,7 @@ def feasibility(
     max_rotation: float = 1e-2,
     duration: float = 0.1,
     pool: PhysicsPool | None = None,
+    physics: EngineName | None = None,
 ) -> FeasibilityResult:
     """Feasibility of every object: whether it overlaps another one, and whether it stays where it is.
 
@@ -263,11 +277,12 @@ def feasibility(
         max_rotation: Largest geodesic angle of rotation, rad.
         duration: Simulated time, s.
         pool: worker processes; None computes in this process.
+        physics: engine; None takes that of the pool, else ``auto``.
 
     Raises:
         InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot. A
             limit is negative or NaN, or the duration is not a positive number.
-        MissingDependencyError: pybullet is not installed.
+        MissingDependencyError: the engine is not installed.
     """
     limits = {
         "max_penetration": max_penetration,
@@ -275,7 +290,7 @@ def feasibility(
         "max_rotation": max_rotation,
     }
     check_numbers(duration, **limits)
-    rows = run_kernel("feasibility", batch, limits | {"duration": duration}, pool)
+    rows = run_kernel("feasibility", batch, limits | {"duration": duration}, chosen_pool(pool, physics))
     feasible = stack(rows, batch, "feasible", torch.bool) & batch.in_workspace.cpu()
     return FeasibilityResult(
         feasible=feasible,
@@ -287,14 +302,16 @@ def feasibility(
     )
 
 
-def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> PenetrationResult:
+def penetration(
+    batch: SceneBatch, *, pool: PhysicsPool | None = None, physics: EngineName | None = None
+) -> PenetrationResult:
     """Overlap of every object pair, and the total over pairs of convex parts.
 
     No simulator is needed. A scene with a heap of objects whose exact depths would take too long is invalid.
 
     Raises InvalidInputError as :func:`feasibility` does.
     """
-    rows = run_kernel("penetration", batch, {}, pool)
+    rows = run_kernel("penetration", batch, {}, chosen_pool(pool, physics))
     pairs = tuple(
         tuple(ObjectPair((a, b), depth, total, parts) for a, b, depth, total, parts in (row["pairs"] if row else ()))
         for row in rows
@@ -308,7 +325,9 @@ def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Penetr
     )
 
 
-def furniture_overlap(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> Tensor:
+def furniture_overlap(
+    batch: SceneBatch, *, pool: PhysicsPool | None = None, physics: EngineName | None = None
+) -> Tensor:
     """Deepest overlap of each generated welded object with any other welded one, (B, N) m; 0 in all other slots.
 
     Rooms generate their tables and shelves, which are welded. :func:`feasibility` and :func:`penetration` do not judge
@@ -321,10 +340,12 @@ def furniture_overlap(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> 
     """
     if not bool(batch.is_furniture.any()):
         return torch.zeros(batch.tensor.shape[:2])
-    return stack(run_kernel("furniture", batch, {}, pool), batch, "depth")
+    return stack(run_kernel("furniture", batch, {}, chosen_pool(pool, physics)), batch, "depth")
 
 
-def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool | None = None) -> EquilibriumResult:
+def equilibrium(
+    batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool | None = None, physics: EngineName | None = None
+) -> EquilibriumResult:
     """Displacement of every object under gravity in ``duration`` seconds, nothing removed.
 
     A heap is invalid: its objects overlap so deeply that its simulation would take too long. Project it first. A scene
@@ -333,12 +354,17 @@ def equilibrium(batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool |
     Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
     """
     check_numbers(duration)
-    rows = run_kernel("equilibrium", batch, {"duration": duration}, pool)
+    rows = run_kernel("equilibrium", batch, {"duration": duration}, chosen_pool(pool, physics))
     return EquilibriumResult(stack(rows, batch, "displacement"), stack(rows, batch, "rotation"), valid_rows(rows))
 
 
 def settle(
-    batch: SceneBatch, *, duration: float = 1.0, iterations: int = ITERATIONS, pool: PhysicsPool | None = None
+    batch: SceneBatch,
+    *,
+    duration: float = 1.0,
+    iterations: int = ITERATIONS,
+    pool: PhysicsPool | None = None,
+    physics: EngineName | None = None,
 ) -> SettleResult:
     """Let every scene come to rest under gravity, with slight damping.
 
@@ -353,6 +379,7 @@ def settle(
         duration: Longest simulated time, s.
         iterations: Iterations of the contact solver per step; more of them leave smaller overlaps.
         pool: worker processes; None computes in this process.
+        physics: engine; None takes that of the pool, else ``auto``.
 
     Raises InvalidInputError, also for fewer than one iteration or a duration that is not positive, and
     MissingDependencyError as :func:`feasibility` does.
@@ -360,20 +387,22 @@ def settle(
     if iterations < 1:
         raise InvalidInputError(f"iterations={iterations} must be at least 1")
     check_numbers(duration)
-    rows = run_kernel("settle", batch, {"duration": duration, "iterations": iterations}, pool)
+    rows = run_kernel("settle", batch, {"duration": duration, "iterations": iterations}, chosen_pool(pool, physics))
     settled, displacement, rotation = poses_after(rows, batch)
     finished = stack(rows, batch, "finished", torch.bool, shape=())
     return SettleResult(settled, displacement, rotation, finished, valid_rows(rows))
 
 
-def project(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> ProjectionResult:
+def project(
+    batch: SceneBatch, *, pool: PhysicsPool | None = None, physics: EngineName | None = None
+) -> ProjectionResult:
     """The nearest scenes without overlap: translations change, rotations and welded objects do not.
 
     Objects may touch. If there is no room to separate them, the best effort is returned and ``converged`` is False.
 
     Raises InvalidInputError as :func:`feasibility` does.
     """
-    rows = run_kernel("project", batch, {}, pool)
+    rows = run_kernel("project", batch, {}, chosen_pool(pool, physics))
     projected, moved, _ = poses_after(rows, batch)
     return ProjectionResult(
         batch=projected,

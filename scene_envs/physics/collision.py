@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
+from typing import Protocol
 
 import numpy as np
 
@@ -296,12 +297,69 @@ def _blocks(work: Index, limit: int) -> Iterator[slice]:
         start = end
 
 
+class Depths(Protocol):
+    """How deep objects overlap."""
+
+    def __call__(
+        self, objects: Objects, first: Index, second: Index, gap: Array, totals: bool
+    ) -> tuple[Array, Array, Index]:
+        """Depth (P,) m of the fine parts of each pair of objects, whose coarse parts have the signed ``gap`` (P,) m. With
+        ``totals``, also the sum of the depths of all pairs of their parts (P,) m, and the number of these (P,).
+        """
+
+
+class ExactDepths:
+    """Exact depths of a library's parts: face planes bound them from above, and the deepest are computed."""
+
+    def __init__(self, library: LibraryGeometry) -> None:
+        self._library = library
+        self.exact = PenetrationDepth([part.vertices for part in library.parts])
+
+    def __call__(
+        self, objects: Objects, first: Index, second: Index, gap: Array, totals: bool
+    ) -> tuple[Array, Array, Index]:
+        """See :class:`Depths`."""
+        depth, total, part_count = np.zeros(len(gap)), np.zeros(len(gap)), np.zeros(len(gap), dtype=np.int64)
+        # The depth of objects that barely touch is the bound from the face planes of the enclosing coarse parts.
+        # Sums over part pairs need the fine parts, unless each of the two objects has only one.
+        simple = gap > -TOUCHING
+        if totals:
+            single = np.array([len(asset.fine.parts) == 1 for asset in self._library.assets])
+            simple &= single[objects.category[first]] & single[objects.category[second]]
+        depth[simple] = total[simple] = -gap[simple]
+        part_count[simple] = 1
+        hard = np.flatnonzero(~simple)
+        if not len(hard):
+            return depth, total, part_count
+        used, local = np.unique(np.concatenate([first[hard], second[hard]]), return_inverse=True)
+        fine = place(self._library, objects[used], "fine")
+        pair, a, b = part_pairs(fine, local[: len(hard)], local[len(hard) :])
+        near = _boxes_near(fine.low, fine.high, a, b, 0.0)
+        pair, a, b = pair[near], a[near], b[near]
+        bound, _ = separations(self._library, fine.parts, a, b)
+        bound = -bound
+        deep = bound > 0
+        pair, a, b, bound = pair[deep], a[deep], b[deep], bound[deep]
+        order = np.lexsort((-bound, pair))
+        a, b, bound, target = a[order], b[order], bound[order], hard[pair[order]]
+        for rows in _rounds(target, bound, depth, totals):
+            value = bound[rows]
+            ask = np.flatnonzero(value > TOUCHING)
+            exact, _ = self.exact(fine.parts, a[rows[ask]], b[rows[ask]])
+            value[ask] = np.minimum(value[ask], exact)
+            meet = value > 0
+            np.maximum.at(depth, target[rows[meet]], value[meet])
+            np.add.at(total, target[rows[meet]], value[meet])
+            np.add.at(part_count, target[rows[meet]], 1)
+        return depth, total, part_count
+
+
 class Collider:
     """Search for near and overlapping objects; geometry is built once, poses are arguments."""
 
-    def __init__(self, library: LibraryGeometry) -> None:
+    def __init__(self, library: LibraryGeometry, depths: Depths) -> None:
         self.library = library
-        self.depth = PenetrationDepth([part.vertices for part in library.parts])
+        self._depths = depths
 
     def pairs(self, objects: Objects, *, totals: bool = False) -> ObjectPairs:
         """Near pairs of objects within each of one or more scenes; two fixed objects are never a pair. With ``totals``
@@ -327,7 +385,7 @@ class Collider:
             rough[overlapping] = tests[objects.scene[a]] > _TOO_MANY
             depth[rough] = -gap[rough]
             exact = overlapping[~rough[overlapping]]
-            found = self._fine_depths(objects, first[exact], second[exact], gap[exact], totals)
+            found = self._depths(objects, first[exact], second[exact], gap[exact], totals)
             depth[exact], total[exact], part_count[exact] = found
         return ObjectPairs(first, second, gap, direction, depth, total, part_count, low, high, contacts, rough)
 
@@ -353,44 +411,6 @@ class Collider:
         gap, direction = separations(self.library, placed.parts, a, b)
         part = placed.parts.part
         return Contacts(first[pair], second[pair], part[a], part[b], gap, direction), pair
-
-    def _fine_depths(
-        self, objects: Objects, first: Index, second: Index, gap: Array, totals: bool
-    ) -> tuple[Array, Array, Index]:
-        """Depth (P,) m of each object pair, sum of the depths of its part pairs (P,) m, and their number (P,)."""
-        depth, total, part_count = np.zeros(len(gap)), np.zeros(len(gap)), np.zeros(len(gap), dtype=np.int64)
-        # The depth of objects that barely touch is the bound from the face planes of the enclosing coarse parts.
-        # Sums over part pairs need the fine parts, unless each of the two objects has only one.
-        simple = gap > -TOUCHING
-        if totals:
-            single = np.array([len(asset.fine.parts) == 1 for asset in self.library.assets])
-            simple &= single[objects.category[first]] & single[objects.category[second]]
-        depth[simple] = total[simple] = -gap[simple]
-        part_count[simple] = 1
-        hard = np.flatnonzero(~simple)
-        if not len(hard):
-            return depth, total, part_count
-        used, local = np.unique(np.concatenate([first[hard], second[hard]]), return_inverse=True)
-        fine = place(self.library, objects[used], "fine")
-        pair, a, b = part_pairs(fine, local[: len(hard)], local[len(hard) :])
-        near = _boxes_near(fine.low, fine.high, a, b, 0.0)
-        pair, a, b = pair[near], a[near], b[near]
-        bound, _ = separations(self.library, fine.parts, a, b)
-        bound = -bound
-        deep = bound > 0
-        pair, a, b, bound = pair[deep], a[deep], b[deep], bound[deep]
-        order = np.lexsort((-bound, pair))
-        a, b, bound, target = a[order], b[order], bound[order], hard[pair[order]]
-        for rows in _rounds(target, bound, depth, totals):
-            value = bound[rows]
-            ask = np.flatnonzero(value > TOUCHING)
-            exact, _ = self.depth(fine.parts, a[rows[ask]], b[rows[ask]])
-            value[ask] = np.minimum(value[ask], exact)
-            meet = value > 0
-            np.maximum.at(depth, target[rows[meet]], value[meet])
-            np.add.at(total, target[rows[meet]], value[meet])
-            np.add.at(part_count, target[rows[meet]], 1)
-        return depth, total, part_count
 
 
 def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, second: Index) -> Array:

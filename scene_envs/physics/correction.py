@@ -45,7 +45,7 @@ def corrections(batch: SceneBatch, spread: Array, movable: Mask | None = None) -
     >>> corrections(SceneBatch.empty("dimsum_table", 1), np.ones(3)).abs().max()
     tensor(0.)
     """
-    physics, moves = physics_of(batch.scene_type), np.zeros((*batch.tensor.shape[:2], 3))
+    physics, moves = physics_of(batch.scene_type, "bullet"), np.zeros((*batch.tensor.shape[:2], 3))
     movable = np.ones(batch.tensor.shape[:2], dtype=bool) if movable is None else movable
     cost = 1.0 / np.maximum(spread / max(float(spread.max()), 1e-12), _MIN_SPREAD)
     workspace = batch.scene_type.workspace

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.arrays import Array, Index
+from scene_envs.physics.engines import Course
 from scene_envs.physics.motion import Physics, motion, physics_of, settle_scene
 from scene_envs.physics.placement import Budget, ObjectPairs, Objects, flatten, simulation_units
 from scene_envs.physics.projection import TOLERANCE, heaps, project_objects
@@ -47,9 +48,9 @@ def _is_heap(physics: Physics, objects: Objects) -> bool:
     return True
 
 
-def _start(chunk: Chunk) -> tuple[Physics, Objects, NDArray[np.bool_]]:
+def _start(chunk: Chunk, engine: str) -> tuple[Physics, Objects, NDArray[np.bool_]]:
     """Physics and objects of a chunk, and the validity (b,) of its scenes: so far, all are valid."""
-    physics = physics_of(chunk.scene_type)
+    physics = physics_of(chunk.scene_type, engine)
     welded = np.isin(chunk.categories, np.array(chunk.scene_type.welded_categories, dtype=np.int64))
     objects = flatten(physics.library, chunk.translations, chunk.rotations, chunk.categories, welded)
     return physics, objects, np.ones(len(chunk), dtype=bool)
@@ -66,6 +67,7 @@ def _budgets(chunk: Chunk, objects: Objects, pairs: ObjectPairs) -> list[Budget]
 def feasibility_kernel(
     chunk: Chunk,
     *,
+    engine: str,
     max_penetration: float,
     max_displacement: float,
     max_rotation: float,
@@ -73,7 +75,7 @@ def feasibility_kernel(
     tilt: tuple[float, float] = (0.0, 0.0),
 ) -> dict[str, Any]:
     """See :func:`scene_envs.physics.feasibility`; gravity is tilted by ``tilt`` (rad) toward the x and the y axis."""
-    physics, objects, valid = _start(chunk)
+    physics, objects, valid = _start(chunk, engine)
     pairs = physics.collider.pairs(objects)
     depth = pairs.deepest()
     deep = depth > max_penetration
@@ -95,9 +97,9 @@ def feasibility_kernel(
     }
 
 
-def equilibrium_kernel(chunk: Chunk, *, duration: float) -> dict[str, Any]:
+def equilibrium_kernel(chunk: Chunk, *, engine: str, duration: float) -> dict[str, Any]:
     """See :func:`scene_envs.physics.equilibrium`."""
-    physics, objects, valid = _start(chunk)
+    physics, objects, valid = _start(chunk, engine)
     valid[:] = [not _is_heap(physics, objects[objects.scene == index]) for index in range(len(chunk))]
     objects = objects[valid[objects.scene]]
     pairs = physics.collider.pairs(objects)
@@ -110,9 +112,9 @@ def equilibrium_kernel(chunk: Chunk, *, duration: float) -> dict[str, Any]:
     }
 
 
-def penetration_kernel(chunk: Chunk) -> dict[str, Any]:
+def penetration_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
     """See :func:`scene_envs.physics.penetration`."""
-    physics, objects, valid = _start(chunk)
+    physics, objects, valid = _start(chunk, engine)
     pairs = physics.collider.pairs(objects, totals=True)
     valid[objects.scene[pairs.first[pairs.rough]]] = False
     if not valid.all():
@@ -131,9 +133,9 @@ def penetration_kernel(chunk: Chunk) -> dict[str, Any]:
     }
 
 
-def furniture_kernel(chunk: Chunk) -> dict[str, Any]:
+def furniture_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
     """See :func:`scene_envs.physics.furniture_overlap`."""
-    physics, objects, valid = _start(chunk)
+    physics, objects, valid = _start(chunk, engine)
     categories = chunk.scene_type.welded_categories, chunk.scene_type.furniture_categories
     is_welded, is_furniture = (np.isin(objects.category, np.array(some, dtype=np.int64)) for some in categories)
     welded, furniture = objects[is_welded], is_furniture[is_welded]
@@ -142,21 +144,21 @@ def furniture_kernel(chunk: Chunk) -> dict[str, Any]:
     return {"depth": _scatter(chunk, welded, depth), "valid": valid}
 
 
-def settle_kernel(chunk: Chunk, *, duration: float, iterations: int) -> dict[str, Any]:
+def settle_kernel(chunk: Chunk, *, engine: str, duration: float, iterations: int) -> dict[str, Any]:
     """See :func:`scene_envs.physics.settle`."""
     translations, rotations, valid = chunk.translations.copy(), chunk.rotations.copy(), np.ones(len(chunk), dtype=bool)
     finished, spent = np.ones(len(chunk), dtype=bool), np.zeros(len(chunk))
     bottom = chunk.scene_type.workspace[0][2] - _FALLEN
     for index in range(len(chunk)):
         row = chunk[index : index + 1]
-        physics, objects, _ = _start(row)
+        physics, objects, _ = _start(row, engine)
         valid[index] = not _is_heap(physics, objects)
         if not valid[index]:
             continue
         pairs = physics.collider.pairs(objects)
         (budget,) = _budgets(row, objects, pairs)
         new_rotation, new_translation, valid[index] = settle_scene(
-            physics, objects, pairs, duration, iterations, bottom, budget
+            physics, objects, pairs, duration, bottom, Course(budget, settling=iterations)
         )
         finished[index], spent[index] = not budget.is_spent, budget.spent
         if valid[index]:
@@ -171,12 +173,12 @@ def settle_kernel(chunk: Chunk, *, duration: float, iterations: int) -> dict[str
     }
 
 
-def projection_kernel(chunk: Chunk) -> dict[str, Any]:
+def projection_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
     """See :func:`scene_envs.physics.project`."""
     translations = chunk.translations.copy()
     residual, heap = np.zeros(len(chunk)), np.zeros(len(chunk), dtype=bool)
     for index in range(len(chunk)):
-        physics, objects, _ = _start(chunk[index : index + 1])
+        physics, objects, _ = _start(chunk[index : index + 1], engine)
         result = project_objects(physics.collider, objects, chunk.scene_type.workspace)
         translations[index, objects.slot] = result.translation
         residual[index], heap[index] = result.residual_depth, result.heap
@@ -189,11 +191,11 @@ def projection_kernel(chunk: Chunk) -> dict[str, Any]:
     }
 
 
-def units_kernel(chunk: Chunk) -> dict[str, Any]:
+def units_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
     """Units of simulation that each scene may spend; 0 for heaps, which are not simulated."""
     units = np.zeros(len(chunk))
     for index in range(len(chunk)):
-        physics, objects, _ = _start(chunk[index : index + 1])
+        physics, objects, _ = _start(chunk[index : index + 1], engine)
         if not heaps(physics.collider, objects).any():
             units[index] = simulation_units(objects, physics.collider.pairs(objects))
     return {"units": units, "valid": np.ones(len(chunk), dtype=bool)}

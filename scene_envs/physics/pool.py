@@ -11,8 +11,10 @@ from typing import Any
 
 from scene_envs.assets.base import Asset, AssetLibrary
 from scene_envs.errors import InvalidInputError
+from scene_envs.physics import EngineName
+from scene_envs.physics.engines import engine_name
 from scene_envs.physics.kernels import KERNELS, Chunk
-from scene_envs.physics.motion import physics_of
+from scene_envs.physics.parts import library_geometry
 from scene_envs.scene_types import SceneType
 from scene_envs.workers import Task, WorkerFailure, WorkerPool
 
@@ -35,7 +37,7 @@ class KernelRunner:
             _, key, scene_type, assets = message
             scene_type.__dict__["library"] = AssetLibrary(assets)  # what the cached property would hold
             self._scene_types[key] = scene_type
-            physics_of(scene_type)  # geometry is built before the first chunk's clock starts
+            library_geometry(scene_type.library.assets)  # geometry is built before the first chunk's clock starts
             return None
         kernel, scene_type, arrays, options = message
         return KERNELS[kernel](Chunk(self._scene_types.get(scene_type, scene_type), *arrays), **options)
@@ -51,13 +53,17 @@ class PhysicsPool(WorkerPool):
     Args:
         workers: number of processes; 0 computes in this process.
         timeout: seconds that a chunk of up to eight scenes may take.
+        physics: engine that computes overlap and motion.
 
     >>> with PhysicsPool(workers=0) as pool:
     ...     pool.workers
     0
     """
 
-    def __init__(self, workers: int | None = 1, timeout: float = 60.0, **options: Any) -> None:
+    def __init__(
+        self, workers: int | None = 1, timeout: float = 60.0, physics: EngineName = "auto", **options: Any
+    ) -> None:
+        self.engine = engine_name(physics)
         options = {"environment": _ENVIRONMENT, **options}
         super().__init__(f"{__name__}:KernelRunner", workers=workers, timeout=timeout, **options)
         self._scene_types: dict[tuple[SceneType, tuple[int, ...]], tuple[int, tuple[Asset, ...]]] = {}
@@ -69,7 +75,10 @@ class PhysicsPool(WorkerPool):
         twice. Raises SceneEnvsError where the kernel refuses (a missing dependency, an unknown asset).
         """
         firsts = accumulate(map(len, chunks), initial=0)
-        tasks = [self._task(kernel, chunk, dict(options), first) for chunk, first in zip(chunks, firsts, strict=False)]
+        tasks = [
+            self._task(kernel, chunk, {**options, "engine": self.engine}, first)
+            for chunk, first in zip(chunks, firsts, strict=False)
+        ]
         rows: list[dict[str, Any] | None] = []
         for result in self.map(tasks):
             if isinstance(result, WorkerFailure):
@@ -111,22 +120,24 @@ class RayPhysicsPool(PhysicsPool):
 
     Args:
         timeout: seconds that a chunk of up to eight scenes may take.
+        physics: engine that computes overlap and motion.
 
     Raises:
         MissingDependencyError: Ray is not installed.
         InvalidInputError: there is no cluster at ``RAY_ADDRESS``.
     """
 
-    def __init__(self, timeout: float = 60.0) -> None:
-        super().__init__(None, timeout, ray=True)
+    def __init__(self, timeout: float = 60.0, physics: EngineName = "auto") -> None:
+        super().__init__(None, timeout, physics, ray=True)
 
 
-def make_pool(workers: int | str, timeout: float = 60.0) -> PhysicsPool:
+def make_pool(workers: int | str, timeout: float = 60.0, physics: EngineName = "auto") -> PhysicsPool:
     """A pool of processes of this machine, or with ``"ray"`` of a Ray cluster.
 
     Args:
         workers: number of processes, 0 for this one alone; ``"ray"`` for as many as the cluster has CPUs.
         timeout: seconds for a chunk, as :class:`PhysicsPool` takes it.
+        physics: engine that computes overlap and motion.
 
     Raises:
         InvalidInputError: ``workers`` is neither a whole number nor ``"ray"``.
@@ -135,9 +146,9 @@ def make_pool(workers: int | str, timeout: float = 60.0) -> PhysicsPool:
     0
     """
     if workers == "ray":
-        return RayPhysicsPool(timeout)
+        return RayPhysicsPool(timeout, physics)
     if not isinstance(workers, int):
         raise InvalidInputError(
             f"workers={workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
         )
-    return PhysicsPool(workers, timeout)
+    return PhysicsPool(workers, timeout, physics)

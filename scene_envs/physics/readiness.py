@@ -11,9 +11,11 @@ import torch
 from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
+from scene_envs.physics import EngineName
 from scene_envs.physics.api import (
     ReadyResult,
     check_numbers,
+    chosen_pool,
     poses_after,
     project,
     run_kernel,
@@ -21,7 +23,7 @@ from scene_envs.physics.api import (
     stack,
     valid_rows,
 )
-from scene_envs.physics.motion import CONVERGED, ITERATIONS
+from scene_envs.physics.engines import CONVERGED, ITERATIONS
 from scene_envs.physics.pool import PhysicsPool
 from scene_envs.scene import SceneBatch
 
@@ -50,7 +52,12 @@ _UNMOVED = 1e-4
 
 
 def make_ready(
-    batch: SceneBatch, *, duration: float = 1.5, rounds: int = 5, pool: PhysicsPool | None = None
+    batch: SceneBatch,
+    *,
+    duration: float = 1.5,
+    rounds: int = 5,
+    pool: PhysicsPool | None = None,
+    physics: EngineName | None = None,
 ) -> ReadyResult:
     """Project, settle, then count the simulation-ready objects.
 
@@ -71,12 +78,14 @@ def make_ready(
         duration: Longest time to settle in each round, s.
         rounds: Largest number of rounds per scene, at least 1.
         pool: worker processes; None computes in this process.
+        physics: engine; None takes that of the pool, else ``auto``.
 
     Raises InvalidInputError, also for ``rounds`` below 1, and MissingDependencyError as :func:`feasibility` does.
     """
     if rounds < 1:
         raise InvalidInputError(f"rounds={rounds} must be at least 1: each projects and settles once")
     check_numbers(duration)
+    pool = chosen_pool(pool, physics)
     units = stack(run_kernel("units", batch, {}, pool), batch, "units", torch.float64, shape=())
     reserve = (1.0 - _ROUNDS_SHARE) * units
     units = units - reserve
@@ -131,9 +140,7 @@ class _Round:
         return self.ready.sum(dim=-1)
 
 
-def _make_ready_once(
-    batch: SceneBatch, duration: float, iterations: int, units: Tensor, pool: PhysicsPool | None
-) -> _Round:
+def _make_ready_once(batch: SceneBatch, duration: float, iterations: int, units: Tensor, pool: PhysicsPool) -> _Round:
     """One round of :func:`make_ready`; subtracts the work done from ``units`` (B,), in place."""
     projected = project(batch, pool=pool)
     rows = (projected.valid & ~projected.heap).nonzero()[:, 0]
@@ -149,7 +156,7 @@ def _make_ready_once(
     return _Round(SceneBatch(tensor, batch.scene_type), ready, valid, valid & (units > 0), lasting)
 
 
-def _judge_round(batch: SceneBatch, units: Tensor, pool: PhysicsPool | None) -> tuple[Tensor, Tensor]:
+def _judge_round(batch: SceneBatch, units: Tensor, pool: PhysicsPool) -> tuple[Tensor, Tensor]:
     """(B, N) free objects that stay in the trials of a round, and (B,) whether all objects stayed in all trials. Only
     scenes in which every free object in the workspace stays in the shorter trials go on to tilted gravity, then the
     longest trial; others have another round. The work done is subtracted from ``units`` (B,), in place.
@@ -169,7 +176,7 @@ def _judge_round(batch: SceneBatch, units: Tensor, pool: PhysicsPool | None) -> 
 
 
 def _strike(
-    batch: SceneBatch, ready: Tensor, trials: Sequence[dict[str, Any]], units: Tensor, pool: PhysicsPool | None
+    batch: SceneBatch, ready: Tensor, trials: Sequence[dict[str, Any]], units: Tensor, pool: PhysicsPool
 ) -> Tensor:
     """``ready`` (B, N) without the objects that move in a trial; each trial is made without those removed before."""
     ready = ready.clone()
@@ -179,7 +186,7 @@ def _strike(
     return ready
 
 
-def _strike_until_still(batch: SceneBatch, ready: Tensor, units: Tensor, pool: PhysicsPool | None) -> Tensor:
+def _strike_until_still(batch: SceneBatch, ready: Tensor, units: Tensor, pool: PhysicsPool) -> Tensor:
     """``ready`` (B, N) without the objects that move in the longest trial, which is repeated where it removed objects.
     If it removes objects again, all that moved in it by ``_UNMOVED`` or more are removed.
     """
@@ -198,7 +205,7 @@ def _strike_until_still(batch: SceneBatch, ready: Tensor, units: Tensor, pool: P
 
 
 def _judge(
-    kept: SceneBatch, scenes: Tensor, trial: dict[str, Any], units: Tensor, pool: PhysicsPool | None
+    kept: SceneBatch, scenes: Tensor, trial: dict[str, Any], units: Tensor, pool: PhysicsPool
 ) -> tuple[Tensor, Tensor]:
     """Objects (b, N) that keep their pose, none in invalid scenes, and the displacement (b, N) m of all objects."""
     options = {"max_penetration": _READY_DEPTH} | trial
