@@ -16,7 +16,6 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.errors import PhysicsError
-from scene_envs.physics.collision import ExactDepths
 from scene_envs.physics.engines import CONVERGED, DAMPING, ITERATIONS, Course, Moved, gravity
 from scene_envs.physics.parts import (
     FRICTION,
@@ -243,7 +242,6 @@ class BulletEngine:
 
     def __init__(self, library: LibraryGeometry) -> None:
         self._library = library
-        self.depths = ExactDepths(library)
         self._lock = threading.Lock()
 
     @cached_property

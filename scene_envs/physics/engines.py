@@ -10,7 +10,7 @@ import importlib.util
 import logging
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Protocol, get_args
+from typing import Protocol, get_args
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.physics import EngineName
 from scene_envs.physics.parts import GRAVITY, LibraryGeometry
 from scene_envs.physics.placement import Budget, Objects
-
-if TYPE_CHECKING:
-    from scene_envs.physics.collision import Depths
 
 _LOGGER = logging.getLogger(__name__)
 ITERATIONS, CONVERGED = 35, 150
@@ -64,9 +61,6 @@ class Course:
 
 class Engine(Protocol):
     """What computes overlap and motion of the objects of one asset library. Results depend on the arguments alone."""
-
-    depths: Depths
-    """How deep objects overlap."""
 
     def simulate(self, cluster: Objects, fine: Mask, height: Index, duration: float, course: Course) -> Moved:
         """Where the objects (n,) of one scene are after ``duration`` seconds under gravity.

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.arrays import Array, Index
+from scene_envs.physics.collision import TOO_MANY, corner_tests
 from scene_envs.physics.engines import Course
 from scene_envs.physics.motion import Physics, motion, physics_of, settle_scene
 from scene_envs.physics.placement import Budget, ObjectPairs, Objects, flatten, simulation_units
@@ -115,18 +116,24 @@ def equilibrium_kernel(chunk: Chunk, *, engine: str, duration: float) -> dict[st
 def penetration_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
     """See :func:`scene_envs.physics.penetration`."""
     physics, objects, valid = _start(chunk, engine)
-    pairs = physics.collider.pairs(objects, totals=True)
-    valid[objects.scene[pairs.first[pairs.rough]]] = False
+    found = physics.collider.overlaps(objects)
+    tests = corner_tests(physics.library, objects, found.first, found.second)
+    tests = np.bincount(objects.scene[found.first], weights=tests, minlength=len(chunk))
+    valid[tests > TOO_MANY] = False
+    valid[found.unmeasured] = False
     if not valid.all():
         _LOGGER.warning("objects of a scene overlap too much to be measured one by one; its row is invalid")
     listed: list[list[tuple[int, int, float, float, int]]] = [[] for _ in range(len(chunk))]
-    for row in np.flatnonzero(pairs.depth > 0):
-        a, b = pairs.first[row], pairs.second[row]
-        entry = (int(objects.slot[a]), int(objects.slot[b]), float(pairs.depth[row]), float(pairs.total[row]))
-        listed[objects.scene[a]].append((*entry, int(pairs.part_count[row])))
+    deepest = np.zeros(len(objects))
+    for a, b, depth, total, count in zip(
+        found.first, found.second, found.depth, found.total, found.part_count, strict=True
+    ):
+        slots = int(objects.slot[a]), int(objects.slot[b])
+        listed[objects.scene[a]].append((*slots, float(depth), float(total), int(count)))
+        deepest[[a, b]] = np.maximum(deepest[[a, b]], depth)
     return {
         "pairs": listed,
-        "depth": _scatter(chunk, objects, pairs.deepest()),
+        "depth": _scatter(chunk, objects, deepest),
         "total_per_pair": np.array([sum(entry[2] for entry in scene) for scene in listed]),
         "total_per_geometry": np.array([sum(entry[3] for entry in scene) for scene in listed]),
         "valid": valid,

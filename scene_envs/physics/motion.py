@@ -35,7 +35,7 @@ class Physics:
     def __init__(self, library: LibraryGeometry, engine: str) -> None:
         self.library = library
         self.engine = make_engine(engine, library)
-        self.collider = Collider(library, self.engine.depths)
+        self.collider = Collider(library)
         self.support = Support(library)
         self.statics = Statics(library)
 

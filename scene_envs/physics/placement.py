@@ -239,8 +239,6 @@ class ObjectPairs:
     gap: Array  # (P,) m, signed gap of the coarse parts along ``direction``
     direction: Array  # (P, 3) unit vector in the world, from the first object to the second
     depth: Array  # (P,) m, overlap of the fine parts; 0 without overlap
-    total: Array  # (P,) m, sum of the depths of all overlapping fine parts (on request)
-    part_count: Index  # (P,) overlapping fine part pairs (on request)
     low: Array  # (n, 3) lowest corner of each object's box, m
     high: Array  # (n, 3) highest corner of each object's box, m
     contacts: Contacts  # near pairs of the coarse parts of these objects
@@ -253,9 +251,8 @@ class ObjectPairs:
         first, second = number[self.first], number[self.second]
         kept = (first >= 0) & (second >= 0)
         first, second, low, high = first[kept], second[kept], self.low[rows], self.high[rows]
-        gap, direction, depth, total = (column[kept] for column in (self.gap, self.direction, self.depth, self.total))
-        count, contacts, rough = self.part_count[kept], self.contacts.among(number), self.rough[kept]
-        return ObjectPairs(first, second, gap, direction, depth, total, count, low, high, contacts, rough)
+        gap, direction, depth, rough = (column[kept] for column in (self.gap, self.direction, self.depth, self.rough))
+        return ObjectPairs(first, second, gap, direction, depth, low, high, self.contacts.among(number), rough)
 
     def deepest(self) -> Array:
         """(n,) m, the deepest overlap of each object."""
