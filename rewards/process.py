@@ -30,7 +30,7 @@ from rewards.registry import (
     reward_name,
 )
 from scene_envs.errors import InvalidInputError, RewardError, RewardTimeoutError, SceneEnvsError, UnknownNameError
-from scene_envs.physics import PhysicsPool
+from scene_envs.physics import PhysicsPool, make_pool
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type, register_scene_type
 from scene_envs.workers import START_UP, Process, WorkerFailure
@@ -49,6 +49,7 @@ class IsolatedReward:
         memory: GiB that it may allocate beyond what an empty worker needs (on Linux; elsewhere unlimited).
         seed: seed of the run, for rewards that draw random numbers.
         workers: physics workers of a reward that asks for ``context.pool``; 0 computes in its process.
+        physics: engine of that pool.
 
     Raises:
         InvalidInputError: ``reward`` is no valid reward, or a limit is no positive number.
@@ -60,14 +61,21 @@ class IsolatedReward:
     """
 
     def __init__(
-        self, reward: Any, *, timeout: float = 60.0, memory: float = 1.0, seed: int = 0, workers: int = 0
+        self,
+        reward: Any,
+        *,
+        timeout: float = 60.0,
+        memory: float = 1.0,
+        seed: int = 0,
+        workers: int = 0,
+        physics: str = "auto",
     ) -> None:
         if not isinstance(reward, str | Mapping):
             raise InvalidInputError(f"only a reward given by name or as a mapping can be isolated, got {reward!r}")
         check_limits(timeout, memory)
         self.name = self.__name__ = reward_name(reward)
         self.seed = seed
-        self.timeout, self.memory, self.workers = timeout, memory, workers
+        self.timeout, self.memory, self.workers, self.physics = timeout, memory, workers, physics
         self._reward = reward
         self._worker: Process | None = None
         self._lock = threading.Lock()
@@ -121,7 +129,15 @@ class IsolatedReward:
         if self._worker is None or not self._worker.is_alive:
             self._worker = _start(self.name, self.memory)
             try:
-                message = ("make", self._reward, allowed_targets(), allowed_files(), self.workers, self.seed)
+                message = (
+                    "make",
+                    self._reward,
+                    allowed_targets(),
+                    allowed_files(),
+                    self.workers,
+                    self.physics,
+                    self.seed,
+                )
                 vars(self).update(_answer(self._worker, self.name, message, self.timeout))
             except BaseException:
                 self.close()
@@ -181,7 +197,9 @@ class RewardRunner:
         except BaseException as error:
             raise RewardError(f"the reward raised {describe_error(error)}") from None
 
-    def make(self, reward: Any, targets: list[str], files: list[Any], workers: int, seed: int) -> dict[str, bool]:
+    def make(
+        self, reward: Any, targets: list[str], files: list[Any], workers: int, physics: str, seed: int
+    ) -> dict[str, bool]:
         """Make the reward, with generators seeded from the run's; returns its facts."""
         for target in targets:
             allow_reward_targets(target)
@@ -194,7 +212,7 @@ class RewardRunner:
                 f"reward {reward_name(part)!r} learns in the process of a run, but {reward_name(self.reward)!r} has "
                 "parts of other packages and runs in a process of its own; combine it with this package's rewards alone"
             )
-        self.pool = PhysicsPool(workers=workers) if workers else None
+        self.pool = make_pool(workers, physics=physics)
         return facts_of(self.reward)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
@@ -243,7 +261,15 @@ class SeededReward:
         return declared_maximum(self.reward, slots, free_slots)
 
 
-def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: float = 1.0, workers: int = 0) -> Any:
+def run_reward(
+    reward: Any,
+    *,
+    seed: int = 0,
+    timeout: float = 60.0,
+    memory: float = 1.0,
+    workers: int = 0,
+    physics: str = "auto",
+) -> Any:
     """A reward as runs use it: one of this package in this process, any other in a process that can be ended, except
     functions and objects, which exist in this process alone. Arguments as for :class:`IsolatedReward`.
 
@@ -252,7 +278,7 @@ def run_reward(reward: Any, *, seed: int = 0, timeout: float = 60.0, memory: flo
     """
     check_limits(timeout, memory)
     if is_foreign(reward):
-        return IsolatedReward(reward, timeout=timeout, memory=memory, seed=seed, workers=workers)
+        return IsolatedReward(reward, timeout=timeout, memory=memory, seed=seed, workers=workers, physics=physics)
     with seeded_generators(seed):
         resolved = resolve_reward(reward)
     return resolved if isinstance(reward, str) and is_own(resolved) else SeededReward(resolved, seed)

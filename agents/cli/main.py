@@ -362,6 +362,10 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     for key in set(_DATASETS) - kept - set(getattr(settings, "NO_PATHS", ())):
         _check_dataset(key, functools.reduce(lambda value, part: getattr(value, part, None), key.split("."), settings))
     _check_guidance(settings)
+    if physics := getattr(settings, "physics", ""):
+        from scene_envs.physics.engines import engine_name
+
+        engine_name(physics)
     for key in ("reward", "objective"):
         if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
             _ask_for_files(key, getattr(settings, key), allow_local)

@@ -661,12 +661,14 @@ class OutputKeys(DeviceKeys):
         pictures: number of scenes in the galleries; 0 draws none.
         batch_size: scenes denoised at once.
         workers: physics worker processes; 0 computes physics in this process.
+        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
     """
 
     output: str = ""
     pictures: int = 12
     batch_size: int = 64
     workers: int = 2
+    physics: str = "auto"
 
 
 @dataclass

@@ -243,6 +243,7 @@ class _Run:
             **masks,
             objective_scale=config.objective_scale,
             workers=config.workers,
+            physics=config.physics,
             prompt=config.prompt,
             guidance=config.guidance,
             claim_guidance=config.claim_guidance,

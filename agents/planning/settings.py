@@ -49,6 +49,7 @@ class SearchConfig(BudgetKeys, SamplingKeys):
         objective_scale: objective at which Φ is 1; null takes the largest value that the objective declares, or else
             the number of free slots.
         workers: physics worker processes; 0 computes physics in this process.
+        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         prompt: text that all scenes should match, for priors that read prompts; the objective gets it too. null for no
             prompt.
         num_steps: denoiser evaluations per scene.
@@ -67,6 +68,7 @@ class SearchConfig(BudgetKeys, SamplingKeys):
     objective_scale: float | None = None
     physics_guidance: float = 0.0
     workers: int = 0
+    physics: str = "auto"
     planner: PlannerSettings = nested(
         GradientPlanner, folder="planner", option="gradient", kinds=planner_settings, registered=list_planners
     )

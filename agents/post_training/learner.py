@@ -51,7 +51,7 @@ class Learner:
     """Samples scenes under the current policy and updates it. All randomness depends on (seed, purpose, iteration).
     ``reward`` is resolved by :func:`rewards.process.run_reward`; ``batch_size`` counts the scenes of all processes;
     ``slots`` None takes as many as the prior was trained on; ``prompt`` is that of a
-    :class:`~agents.post_training.rollouts.PromptDeck`; ``workers`` may be ``"ray"``.
+    :class:`~agents.post_training.rollouts.PromptDeck`; ``workers`` may be ``"ray"``; ``physics`` names the engine.
     """
 
     def __init__(
@@ -66,6 +66,7 @@ class Learner:
         slots: int | None = None,
         prompt: Any = None,
         workers: int | str = 0,
+        physics: str = "auto",
         seed: int = 0,
     ) -> None:
         self.policy, self.reward = policy, reward
@@ -88,9 +89,10 @@ class Learner:
             prior=self.prior,
             slots=self.slots,
             workers=workers,
+            physics=physics,
             prompt=prompt,
         )
-        self.scorer = RewardScorer(reward, workers) if shared else self.env.core.scorer
+        self.scorer = RewardScorer(reward, workers, physics) if shared else self.env.core.scorer
         self.deck: PromptDeck | None = None
         self.scenes_per_prompt = algorithm.scenes_per_prompt
         self.parameters = [p for p in self.prior.parameters() if p.requires_grad]

@@ -110,7 +110,7 @@ def post_train_and_compare(
     if config.prompt is not None:
         prompts = _measured_prompts(directory, base, config.prompt, scenes, slots, config.seed)
     reward = config.resolved_reward()
-    with make_pool(config.workers, PHYSICS_TIMEOUT) as pool, ExitStack() as stack:
+    with make_pool(config.workers, PHYSICS_TIMEOUT, config.physics) as pool, ExitStack() as stack:
         stack.callback(close_reward, reward)
         load_learned_rewards(reward, directory, config.guard.scenes, config.seed)
 

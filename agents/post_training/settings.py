@@ -474,6 +474,7 @@ class BatchKeys:
     iterations: int = 60
     batch_size: int = 48
     workers: Any = 0
+    physics: str = "auto"
 
 
 @composed
@@ -499,6 +500,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         iterations: number of iterations; each samples one batch of scenes.
         batch_size: scenes sampled per iteration.
         workers: physics worker processes; 0 computes physics in this process; ``ray`` uses the CPUs of a Ray cluster.
+        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         recipe: a named set of values for the other keys: ``ours``, ``demo_clutter`` or ``demo_feasible``. Keys that are
             given as well override it.
         output: run folder; a run that was interrupted there is resumed; empty for runs/COMMAND-TIME on the command
@@ -582,6 +584,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
             timeout=self.reward_timeout,
             memory=self.reward_memory,
             workers=0 if self.workers == "ray" else self.workers,
+            physics=self.physics,
         )
 
     def plain(self) -> dict[str, Any]:

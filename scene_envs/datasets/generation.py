@@ -38,6 +38,7 @@ from scene_envs.files import storage_error, sweep, with_digest, write_json
 from scene_envs.grammars import Grammar, get_grammar
 from scene_envs.grammars.grammar import grammar_factory
 from scene_envs.normalizer import Normalizer
+from scene_envs.physics.engines import engine_name
 from scene_envs.progress import Progress
 from scene_envs.scene import CATEGORY, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
@@ -110,6 +111,7 @@ def generate(
     progress: bool | str = True,
     backend: str = "processes",
     address: str | None = None,
+    physics: str = "auto",
 ) -> GenerationReport:
     """Write ``count`` scenes with three prompts each into the folder ``output``.
 
@@ -129,6 +131,7 @@ def generate(
             :class:`~scene_envs.progress.Progress`.
         backend: ``"processes"`` of this machine, or ``"ray"``.
         address: Address of a running Ray cluster; None starts one on this machine.
+        physics: Engine that verifies, as for :func:`~scene_envs.physics.feasibility`.
 
     Raises:
         InvalidInputError: a bad argument, ``output`` holds a dataset made with other settings, or workers cannot import
@@ -150,9 +153,11 @@ def generate(
     grammar = get_grammar(scene_type)
     folder = Path(output)
     settings = {"grammar": scene_type, "seed": seed, "count": count, "shard_size": shard_size, "verified": verify}
+    if verify:
+        settings["physics"] = physics = engine_name(physics)
     normalizer = _prepare(folder, grammar, settings)
     sizes = [min(shard_size, count - first) for first in range(0, count, shard_size)]
-    jobs = [Job(index, size, seed, verify, folder / shard_name(index)) for index, size in enumerate(sizes)]
+    jobs = [Job(index, size, seed, verify, folder / shard_name(index), physics) for index, size in enumerate(sizes)]
     left = [job for job in jobs if not _is_made(job)]
     with generation_progress(
         f"Generating {scene_type}", count - sum(job.size for job in left), count, progress
@@ -333,22 +338,22 @@ def _ranges(grammar: Grammar) -> tuple[Tensor, Tensor, bool]:
     return low, high, tilted
 
 
-def judge_scenes(batch: SceneBatch) -> list[str]:
+def judge_scenes(batch: SceneBatch, physics: str = "auto") -> list[str]:
     """Reason why each scene is rejected: ``"outside workspace"``, ``"penetration"``, … or :data:`KEPT`.
 
     Runs in the calling process. Scenes are judged in the constructed poses; settling only tests them. The verdict on
-    a scene does not depend on the others of the batch.
+    a scene does not depend on the others of the batch. ``physics`` names the engine.
     """
     inside = (batch.in_workspace | batch.is_empty).all(dim=1)
     verdicts = [KEPT if ok else "outside workspace" for ok in inside.tolist()]
     candidates = torch.nonzero(inside).flatten()
     if len(candidates):
-        for index, verdict in zip(candidates.tolist(), _physics(batch[candidates]), strict=True):
+        for index, verdict in zip(candidates.tolist(), _physics(batch[candidates], physics), strict=True):
             verdicts[index] = verdict
     return verdicts
 
 
-def _physics(batch: SceneBatch) -> list[str]:
+def _physics(batch: SceneBatch, physics: str) -> list[str]:
     from scene_envs.physics import feasibility
 
     result = feasibility(
@@ -357,6 +362,7 @@ def _physics(batch: SceneBatch) -> list[str]:
         max_displacement=MAX_DISPLACEMENT,
         max_rotation=math.inf,
         duration=DURATION,
+        physics=physics,
     )
     shallow = (result.depth <= MAX_PENETRATION).all(dim=1)
     still = ((result.displacement <= MAX_DISPLACEMENT) | ~batch.is_free).all(dim=1)
@@ -375,6 +381,7 @@ class Job:
     seed: int  # seed of the dataset
     verify: bool  # whether to keep only scenes that pass ``judge_scenes``
     path: Path  # path of the shard's file
+    physics: str = "auto"  # engine that verifies
 
     @property
     def journal(self) -> Journal:
@@ -410,7 +417,7 @@ def make_shard(
         if ahead > 0:
             verdicts = [verdict for _, _, verdict in entries]
         else:
-            verdicts = _judge(scenes, grammar, normalizer, job.verify)
+            verdicts = _judge(scenes, grammar, normalizer, job)
             if journal is not None:
                 journal.append(
                     tried, [f"{digest} {verdict}" for digest, verdict in zip(digests, verdicts, strict=True)]
@@ -452,11 +459,11 @@ def _draw(grammar: Grammar, job: Job, first: int, count: int) -> tuple[Tensor, l
     return torch.cat(scenes), reasons
 
 
-def _judge(scenes: Tensor, grammar: Grammar, normalizer: Normalizer, verify: bool) -> list[str]:
+def _judge(scenes: Tensor, grammar: Grammar, normalizer: Normalizer, job: Job) -> list[str]:
     batch = SceneBatch(scenes, grammar.scene_type)
     error = (normalizer.unnormalize(normalizer.normalize(scenes)) - scenes).abs().amax(dim=(1, 2))
     fits = error < 1e-4  # False where a feature varies that is constant in the normalizer
-    verdicts = judge_scenes(batch) if verify else [KEPT] * len(batch)
+    verdicts = judge_scenes(batch, job.physics) if job.verify else [KEPT] * len(batch)
     return [v if v != KEPT or ok else _UNFIT for v, ok in zip(verdicts, fits.tolist(), strict=True)]
 
 

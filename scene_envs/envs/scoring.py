@@ -92,20 +92,21 @@ class Score:
 class RewardScorer:
     """Scorer of batches of scenes on the CPU; its reward, a name, mapping, function or object, is resolved once. The
     ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
+    ``physics`` names the engine.
 
     >>> scorer = RewardScorer("object_count")
     >>> scorer(SceneBatch.empty("dimsum_table", 2)).valid.tolist()
     [True, True]
     """
 
-    def __init__(self, reward: Any, workers: int | str = 0) -> None:
+    def __init__(self, reward: Any, workers: int | str = 0, physics: str = "auto") -> None:
         number = isinstance(workers, int) and workers >= 0
         if not number and workers != "ray":
             raise InvalidInputError(
                 f"workers={workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
             )
         self._score = resolve_reward(reward)
-        self.workers = workers
+        self.workers, self.physics = workers, physics
         self._pool: Any = None
 
     def __call__(self, batch: SceneBatch, prompts: Sequence[str] | None = None) -> Score:
@@ -142,10 +143,10 @@ class RewardScorer:
         return tuple(sorted(output.terms))
 
     def _physics_pool(self) -> Any:
-        if self._pool is None and self.workers != 0:
+        if self._pool is None and (self.workers != 0 or self.physics != "auto"):
             from scene_envs.physics import make_pool
 
-            self._pool = make_pool(self.workers)
+            self._pool = make_pool(self.workers, physics=self.physics)
         return self._pool
 
     def close(self) -> None:

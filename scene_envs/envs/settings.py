@@ -38,6 +38,8 @@ class EnvSettings:
         num_steps: Number of denoising steps of an episode of denoising, or of each scene of a search.
         slots: N, the number of slots per scene; None means the scene type's.
         workers: Number of physics worker processes; 0 computes in this process, ``"ray"`` on a Ray cluster.
+        physics: Engine that computes motion: ``bullet``, ``mujoco`` or ``warp``; ``auto`` takes Bullet where it is
+            installed, else MuJoCo.
         prompt: Description of the wanted scenes, for priors that read prompts; None for none.
         guidance: Weight of classifier-free guidance in the prior's own steps; needs a prompt.
 
@@ -50,6 +52,7 @@ class EnvSettings:
     num_steps: int = 50
     slots: int | None = None
     workers: int | str = 0
+    physics: str = "auto"
     prompt: Any = None
     guidance: float = 0.0
 

@@ -5,7 +5,7 @@ Names load on first use, so that worker processes start without torch.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from scene_envs.registry import lazy_names
 
@@ -28,11 +28,7 @@ if TYPE_CHECKING:
     from scene_envs.physics.pool import PhysicsPool, RayPhysicsPool, make_pool
     from scene_envs.physics.readiness import make_ready
 
-EngineName = Literal["auto", "bullet", "mujoco", "warp"]
-"""What computes overlap and motion; ``auto`` takes Bullet where PyBullet is installed, else MuJoCo."""
-
 __all__ = [
-    "EngineName",
     "EquilibriumResult",
     "FeasibilityResult",
     "ObjectPair",

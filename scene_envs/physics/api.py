@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics import EngineName
 from scene_envs.physics.engines import ITERATIONS, engine_name
 from scene_envs.physics.kernels import Chunk
 from scene_envs.physics.pool import PhysicsPool
@@ -27,7 +26,7 @@ Rows = list[dict[str, Any] | None]
 """Results of a kernel, one per scene."""
 
 
-def chosen_pool(pool: PhysicsPool | None, physics: EngineName | None) -> PhysicsPool:
+def chosen_pool(pool: PhysicsPool | None, physics: str | None) -> PhysicsPool:
     """``pool``, else one that computes in this process with the engine ``physics``, or with that of ``auto``.
 
     Raises InvalidInputError for a pool of another engine, and errors as :func:`~scene_envs.physics.engines.engine_name`.
@@ -260,7 +259,7 @@ def feasibility(
     max_rotation: float = 1e-2,
     duration: float = 0.1,
     pool: PhysicsPool | None = None,
-    physics: EngineName | None = None,
+    physics: str | None = None,
 ) -> FeasibilityResult:
     """Feasibility of every object: whether it overlaps another one, and whether it stays where it is.
 
@@ -302,9 +301,7 @@ def feasibility(
     )
 
 
-def penetration(
-    batch: SceneBatch, *, pool: PhysicsPool | None = None, physics: EngineName | None = None
-) -> PenetrationResult:
+def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None, physics: str | None = None) -> PenetrationResult:
     """Overlap of every object pair, and the total over pairs of convex parts.
 
     No simulator is needed. A scene with a heap of objects whose exact depths would take too long is invalid.
@@ -325,9 +322,7 @@ def penetration(
     )
 
 
-def furniture_overlap(
-    batch: SceneBatch, *, pool: PhysicsPool | None = None, physics: EngineName | None = None
-) -> Tensor:
+def furniture_overlap(batch: SceneBatch, *, pool: PhysicsPool | None = None, physics: str | None = None) -> Tensor:
     """Deepest overlap of each generated welded object with any other welded one, (B, N) m; 0 in all other slots.
 
     Rooms generate their tables and shelves, which are welded. :func:`feasibility` and :func:`penetration` do not judge
@@ -344,7 +339,7 @@ def furniture_overlap(
 
 
 def equilibrium(
-    batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool | None = None, physics: EngineName | None = None
+    batch: SceneBatch, *, duration: float = 0.1, pool: PhysicsPool | None = None, physics: str | None = None
 ) -> EquilibriumResult:
     """Displacement of every object under gravity in ``duration`` seconds, nothing removed.
 
@@ -364,7 +359,7 @@ def settle(
     duration: float = 1.0,
     iterations: int = ITERATIONS,
     pool: PhysicsPool | None = None,
-    physics: EngineName | None = None,
+    physics: str | None = None,
 ) -> SettleResult:
     """Let every scene come to rest under gravity, with slight damping.
 
@@ -393,9 +388,7 @@ def settle(
     return SettleResult(settled, displacement, rotation, finished, valid_rows(rows))
 
 
-def project(
-    batch: SceneBatch, *, pool: PhysicsPool | None = None, physics: EngineName | None = None
-) -> ProjectionResult:
+def project(batch: SceneBatch, *, pool: PhysicsPool | None = None, physics: str | None = None) -> ProjectionResult:
     """The nearest scenes without overlap: translations change, rotations and welded objects do not.
 
     Objects may touch. If there is no room to separate them, the best effort is returned and ``converged`` is False.

@@ -10,13 +10,12 @@ import importlib.util
 import logging
 from dataclasses import dataclass
 from functools import cache
-from typing import Protocol, get_args
+from typing import Protocol
 
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.errors import InvalidInputError, MissingDependencyError
-from scene_envs.physics import EngineName
 from scene_envs.physics.parts import GRAVITY, LibraryGeometry
 from scene_envs.physics.placement import Budget, Objects
 
@@ -26,7 +25,7 @@ ITERATIONS, CONVERGED = 35, 150
 creep nor give way."""
 DAMPING = 0.3
 """Fraction of velocity that objects lose per second while they settle."""
-NAMES: tuple[str, ...] = get_args(EngineName)
+NAMES = ("auto", "bullet", "mujoco", "warp")
 """Names that a user can give."""
 _MODULES = {"bullet": "pybullet", "mujoco": "mujoco", "warp": "mujoco_warp"}
 _INSTALL = {

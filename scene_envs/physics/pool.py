@@ -11,7 +11,6 @@ from typing import Any
 
 from scene_envs.assets.base import Asset, AssetLibrary
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics import EngineName
 from scene_envs.physics.engines import engine_name
 from scene_envs.physics.kernels import KERNELS, Chunk
 from scene_envs.physics.parts import library_geometry
@@ -60,9 +59,7 @@ class PhysicsPool(WorkerPool):
     0
     """
 
-    def __init__(
-        self, workers: int | None = 1, timeout: float = 60.0, physics: EngineName = "auto", **options: Any
-    ) -> None:
+    def __init__(self, workers: int | None = 1, timeout: float = 60.0, physics: str = "auto", **options: Any) -> None:
         self.engine = engine_name(physics)
         options = {"environment": _ENVIRONMENT, **options}
         super().__init__(f"{__name__}:KernelRunner", workers=workers, timeout=timeout, **options)
@@ -127,11 +124,11 @@ class RayPhysicsPool(PhysicsPool):
         InvalidInputError: there is no cluster at ``RAY_ADDRESS``.
     """
 
-    def __init__(self, timeout: float = 60.0, physics: EngineName = "auto") -> None:
+    def __init__(self, timeout: float = 60.0, physics: str = "auto") -> None:
         super().__init__(None, timeout, physics, ray=True)
 
 
-def make_pool(workers: int | str, timeout: float = 60.0, physics: EngineName = "auto") -> PhysicsPool:
+def make_pool(workers: int | str, timeout: float = 60.0, physics: str = "auto") -> PhysicsPool:
     """A pool of processes of this machine, or with ``"ray"`` of a Ray cluster.
 
     Args:

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics import EngineName
 from scene_envs.physics.api import (
     ReadyResult,
     check_numbers,
@@ -57,7 +56,7 @@ def make_ready(
     duration: float = 1.5,
     rounds: int = 5,
     pool: PhysicsPool | None = None,
-    physics: EngineName | None = None,
+    physics: str | None = None,
 ) -> ReadyResult:
     """Project, settle, then count the simulation-ready objects.
 

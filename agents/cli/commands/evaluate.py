@@ -128,7 +128,7 @@ def check(settings: EvaluateConfig) -> None:
 def run(settings: EvaluateConfig, run: Run) -> None:
     """Sample, measure group by group, tabulate."""
     from agents.evaluation.measure import EvaluationInputs, RealScenes, compute_measure
-    from scene_envs.physics import PhysicsPool
+    from scene_envs.physics import make_pool
 
     groups = choose_measures(settings.measures, project=settings.project)
     prior = load_prior(settings)
@@ -152,7 +152,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
     _draw(samples, settings.pictures, run)
     asked = settings.measures.split(",") if isinstance(settings.measures, str) else settings.measures
     optional = "all" in [str(name).strip() for name in asked]
-    with PhysicsPool(workers=settings.workers) as pool:
+    with make_pool(settings.workers, physics=settings.physics) as pool:
         inputs = EvaluationInputs(
             samples,
             real,

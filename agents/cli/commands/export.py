@@ -35,6 +35,7 @@ class ExportConfig(DrawKeys):
         project: make the scenes simulation-ready first (project out of penetration, then settle).
         friction: coefficient of friction of all surfaces.
         workers: physics worker processes; 0 computes physics in this process.
+        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         output: folder for assets/ and scene_000/, scene_001/, ...
     """
 
@@ -45,6 +46,7 @@ class ExportConfig(DrawKeys):
     project: bool = False
     friction: float = 0.6
     workers: int = 2
+    physics: str = "auto"
     output: str = ""
 
 
@@ -63,13 +65,12 @@ def check(settings: ExportConfig) -> None:
 def run(settings: ExportConfig, run: Run) -> None:
     """Read or draw the scenes and write them."""
     from scene_envs.export.formats import resolve_formats
-    from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
 
     formats = resolve_formats(settings.formats)
     batch = _scenes(settings, run)
     metrics: dict[str, Any] = {}
-    with PhysicsPool(workers=settings.workers) as pool:
+    with make_pool(settings.workers, physics=settings.physics) as pool:
         if settings.project:
             metrics["ready"] = make_ready(batch, 0, pool, run)
             batch = SceneBatch.load(run.directory / "ready.safetensors")

@@ -20,6 +20,7 @@ class GenerateConfig(ProgressKeys):
         workers: worker processes; 0 uses this process. With Ray, the number of CPUs of a cluster that this command
             starts.
         verify: keep only scenes that pass physics.
+        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         shard_size: scenes per parquet file.
         backend: processes, for processes of this machine, or ray.
         address: address of a running Ray cluster; null starts one on this machine.
@@ -30,6 +31,7 @@ class GenerateConfig(ProgressKeys):
     count: int = 1000
     seed: int = 0
     workers: int = 2
+    physics: str = "auto"
     verify: bool = True
     shard_size: int = 2000
     backend: str = "processes"

@@ -19,6 +19,7 @@ class ProjectConfig:
         count: number of scenes, from the first; null for all.
         pictures: number of scenes in the galleries; 0 draws none.
         workers: physics worker processes; 0 computes physics in this process.
+        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         output: folder for ready.safetensors, before.png and ready.png.
     """
 
@@ -26,6 +27,7 @@ class ProjectConfig:
     count: int | None = None
     pictures: int = 12
     workers: int = 2
+    physics: str = "auto"
     output: str = ""
 
 
@@ -38,10 +40,10 @@ def check(settings: ProjectConfig) -> None:
 def run(settings: ProjectConfig, run: Run) -> None:
     """Project and settle the scenes, and count the ready objects."""
     from scene_envs.datasets import load_scenes
-    from scene_envs.physics import PhysicsPool
+    from scene_envs.physics import make_pool
 
     batch = load_scenes(Path(settings.scenes), settings.count)
-    with PhysicsPool(workers=settings.workers) as pool:
+    with make_pool(settings.workers, physics=settings.physics) as pool:
         draw_scenes(batch, settings.pictures, run, "before.png")
         run.write_metrics({"scenes": len(batch), "ready": make_ready(batch, settings.pictures, pool, run)})
     run.say(f"written to {run.directory}")

@@ -58,14 +58,18 @@ def run(settings: SampleConfig, run: Run) -> None:
     from agents.priors.guidance import physics_strength
     from rewards.process import close_reward, run_reward
     from scene_envs.export.formats import resolve_formats
-    from scene_envs.physics import PhysicsPool
+    from scene_envs.physics import make_pool
     from scene_envs.scene import SceneBatch
 
     formats = None if settings.export is None else resolve_formats(settings.export)
     reward = None
     if settings.reward is not None:
         reward = run_reward(
-            settings.reward, seed=settings.seed, timeout=settings.reward_timeout, workers=settings.workers
+            settings.reward,
+            seed=settings.seed,
+            timeout=settings.reward_timeout,
+            workers=settings.workers,
+            physics=settings.physics,
         )
     prior = load_prior(settings).with_union(settings.union)
     if not prior.scene_type.has_geometry:
@@ -96,7 +100,7 @@ def run(settings: SampleConfig, run: Run) -> None:
         "sampling_seconds": round(seconds, 3),
         "physics_guidance": strength,
     }
-    with PhysicsPool(workers=settings.workers) as pool:
+    with make_pool(settings.workers, physics=settings.physics) as pool:
         if reward is not None:
             metrics["reward"] = reward_figures(reward, batch, pool, run)
             close_reward(reward)

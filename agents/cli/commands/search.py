@@ -53,7 +53,9 @@ def run(settings: SearchKeys, run: Run) -> None:
     prior = settings.prior or ("dimsum_table" if scenes is None else scenes.scene_type.name)
     objective = settings.objective
     if is_foreign(objective):
-        objective = run_reward(objective, seed=settings.seed, workers=settings.workers, **limits)
+        objective = run_reward(
+            objective, seed=settings.seed, workers=settings.workers, physics=settings.physics, **limits
+        )
     made = prior if settings.device == "cpu" else ScenePrior.load(prior).to(settings.device)
     with _search_progress(search.nfe_per_scene, settings.progress) as show:
         try:
