@@ -43,7 +43,7 @@ def verdicts(batch: SceneBatch, limits: dict[str, float], pool: PhysicsPool | No
     found = dict.fromkeys(keys)
     if fresh:
         rows = sorted(fresh.values())
-        result = feasibility(batch if len(rows) == len(batch) else batch[rows], pool=pool, **limits)
+        result = feasibility(batch if len(rows) == len(batch) else batch[rows], pool=pool, **limits)  # type: ignore[arg-type]
         columns = (result.feasible, result.depth, result.displacement, result.rotation)
         for index, row in enumerate(rows):
             found[keys[row]] = (bool(result.valid[index]), tuple(column[index] for column in columns))

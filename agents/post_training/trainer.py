@@ -148,7 +148,8 @@ class PostTrainer:
         )  # fmt: skip
         self.learner = Learner(
             policy, config.resolved_reward(), config.algorithm, config.optimizer, config.regularisation,
-            batch_size=config.batch_size, slots=config.slots, prompt=config.prompt, workers=config.workers, physics=config.physics,
+            batch_size=config.batch_size, slots=config.slots, prompt=config.prompt, workers=config.workers,
+            physics=config.physics,
             seed=config.seed,
         )  # fmt: skip
         self.iteration = 0

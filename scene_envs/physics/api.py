@@ -29,7 +29,8 @@ Rows = list[dict[str, Any] | None]
 def chosen_pool(pool: PhysicsPool | None, physics: str | None) -> PhysicsPool:
     """``pool``, else one that computes in this process with the engine ``physics``, or with that of ``auto``.
 
-    Raises InvalidInputError for a pool of another engine, and errors as :func:`~scene_envs.physics.engines.engine_name`.
+    Raises InvalidInputError for a pool of another engine, and errors as
+    :func:`~scene_envs.physics.engines.engine_name`.
     """
     if pool is None:
         return PhysicsPool(workers=0, physics=physics or "auto")

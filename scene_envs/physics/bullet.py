@@ -100,8 +100,7 @@ class BodyPool:
         missing = any(len(self._bodies.get(key, ())) < count for key, count in needed.items())
         if missing or have > _SPARE_FACTOR * sum(needed.values()) + _SPARE_BODIES:
             sizes = {key: len(bodies) for key, bodies in self._bodies.items()} if missing else {}
-            spare = {key: count for key, count in needed.items()}
-            self._build({key: max(sizes.get(key, 0), spare.get(key, 0)) for key in {*sizes, *spare}})
+            self._build({key: max(sizes.get(key, 0), needed.get(key, 0)) for key in {*sizes, *needed}})
         return {key: self._bodies[key][:count] for key, count in needed.items()}
 
     def place(self, body: int, position: Sequence[float], quaternion: Sequence[float]) -> None:

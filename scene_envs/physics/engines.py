@@ -64,9 +64,9 @@ class Engine(Protocol):
     def simulate(self, cluster: Objects, fine: Mask, height: Index, duration: float, course: Course) -> Moved:
         """Where the objects (n,) of one scene are after ``duration`` seconds under gravity.
 
-        Objects that are ``fine`` (n,) collide with their fine parts; ``height`` (n,) others carry each object, one above
-        the other. The simulation may end early when all are at rest. Objects that were lost to a numerical failure come
-        back as NaN, and fixed ones where they were.
+        Objects that are ``fine`` (n,) collide with their fine parts; ``height`` (n,) others carry each object, one
+        above the other. The simulation may end early when all are at rest. Objects that were lost to a numerical
+        failure come back as NaN, and fixed ones where they were.
         """
 
 
@@ -103,7 +103,8 @@ def engine_name(physics: str) -> str:
         return _automatic()
     if not is_installed(physics):
         raise MissingDependencyError(
-            f"physics={physics} needs {_MODULES[physics]}, which is not installed; install it with `{_INSTALL[physics]}`"
+            f"physics={physics} needs {_MODULES[physics]}, which is not installed; "
+            f"install it with `{_INSTALL[physics]}`"
         )
     return physics
 

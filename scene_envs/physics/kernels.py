@@ -117,8 +117,8 @@ def penetration_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
     """See :func:`scene_envs.physics.penetration`."""
     physics, objects, valid = _start(chunk, engine)
     found = physics.collider.overlaps(objects)
-    tests = corner_tests(physics.library, objects, found.first, found.second)
-    tests = np.bincount(objects.scene[found.first], weights=tests, minlength=len(chunk))
+    work = corner_tests(physics.library, objects, found.first, found.second)
+    tests = np.bincount(objects.scene[found.first], weights=work, minlength=len(chunk))
     valid[tests > TOO_MANY] = False
     valid[found.unmeasured] = False
     if not valid.all():

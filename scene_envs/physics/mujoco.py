@@ -213,14 +213,15 @@ def _solid(corners: Array) -> Array:
 
 
 class Overlaps:
-    """Exact overlaps of bodies, each a set of convex parts, from the corners (V, 3) m of all parts and the numbers of the
-    parts of each kind of body; corners inside the hull of a part are ignored.
+    """Exact overlaps of bodies, each a set of convex parts, from the corners (V, 3) m of all parts and the numbers of
+    the parts of each kind of body; corners inside the hull of a part are ignored.
 
     A depth is wrong by less than 3 µm, and in nearly all cases by less than 0.1 µm (benchmarks/narrowphase.py).
 
     >>> cube = np.array([(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
     >>> overlaps = Overlaps([cube], [[0]])
-    >>> first, second, depth = overlaps(np.array([0, 0]), np.eye(3)[None].repeat(2, 0), np.array([(0, 0, 0), (0.2, 0, 0.9)]))
+    >>> apart = np.array([(0.0, 0.0, 0.0), (0.2, 0.0, 0.9)])
+    >>> first, second, depth = overlaps(np.array([0, 0]), np.eye(3)[None].repeat(2, 0), apart)
     >>> first.tolist(), second.tolist(), depth.round(6).tolist()
     ([0], [1], [0.1])
     """
@@ -238,8 +239,8 @@ class Overlaps:
     ) -> tuple[Index, Index, Array] | None:
         """Rows (Q,), (Q,) of the bodies of each overlapping pair of parts, the smaller first, and its depth (Q,) m.
 
-        Bodies of a ``kind`` (n,) are at ``rotation`` (n, 3, 3) and ``translation`` (n, 3) m, all finite. Two ``fixed`` (n,)
-        ones are no pair. None where the pairs are too many.
+        Bodies of a ``kind`` (n,) are at ``rotation`` (n, 3, 3) and ``translation`` (n, 3) m, all finite. Two ``fixed``
+        (n,) ones are no pair. None where the pairs are too many.
         """
         fixed = np.zeros(len(kind), dtype=bool) if fixed is None else fixed
         if self._work(kind, translation, fixed) > _TOO_MANY:
@@ -266,9 +267,9 @@ class Overlaps:
     def _certain(self, part: Index, rotation: Array, translation: Array, depth: Array, normal: Array) -> Array:
         """Exact depth (Q,) m of pairs of parts (Q, 2) at rotations (Q, 2, 3, 3) and translations (Q, 2, 3) m.
 
-        MuJoCo's ``depth`` (Q,) is of corners in single precision, and seldom ends too early. The width of both parts along
-        its ``normal`` (Q, 3) is the true depth or more; where the two differ, the depth is computed from the hull of all
-        differences of corners.
+        MuJoCo's ``depth`` (Q,) is of corners in single precision, and seldom ends too early. The width of both parts
+        along its ``normal`` (Q, 3) is the true depth or more; where the two differ, the depth is computed from the hull
+        of all differences of corners.
         """
         far, near = (
             np.einsum(
@@ -320,7 +321,7 @@ class MujocoEngine:
 
     @cached_property
     def _models(self) -> _Models:
-        """Two kinds of body for each asset, with its coarse and with its fine parts, in the frame of its principal axes."""
+        """Two kinds of body for each asset, of coarse and of fine parts, in the frame of its principal axes."""
         bodies = []
         for category, asset in enumerate(self._library.assets):
             turn = self._axes[category].T

@@ -251,8 +251,10 @@ class ObjectPairs:
         first, second = number[self.first], number[self.second]
         kept = (first >= 0) & (second >= 0)
         first, second, low, high = first[kept], second[kept], self.low[rows], self.high[rows]
-        gap, direction, depth, rough = (column[kept] for column in (self.gap, self.direction, self.depth, self.rough))
-        return ObjectPairs(first, second, gap, direction, depth, low, high, self.contacts.among(number), rough)
+        gap, direction, depth = (column[kept] for column in (self.gap, self.direction, self.depth))
+        return ObjectPairs(
+            first, second, gap, direction, depth, low, high, self.contacts.among(number), self.rough[kept]
+        )
 
     def deepest(self) -> Array:
         """(n,) m, the deepest overlap of each object."""

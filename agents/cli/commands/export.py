@@ -65,6 +65,7 @@ def check(settings: ExportConfig) -> None:
 def run(settings: ExportConfig, run: Run) -> None:
     """Read or draw the scenes and write them."""
     from scene_envs.export.formats import resolve_formats
+    from scene_envs.physics import make_pool
     from scene_envs.scene import SceneBatch
 
     formats = resolve_formats(settings.formats)
