@@ -1,0 +1,81 @@
+"""Contacts and gaps of convex parts by FCL (Pan, Chitta and Manocha 2012): only what never ends the process.
+
+These are contact as yes or no, with the default solver, the distance of parts that are apart, and the broadphase.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import fcl
+import numpy as np
+
+from scene_envs.arrays import Array
+from scene_envs.assets.base import Asset, ConvexPart
+
+
+def convex(part: ConvexPart) -> fcl.CollisionObject:
+    """A convex part at the origin."""
+    faces = np.insert(part.faces, 0, 3, axis=1)  # each face begins with its number of corners
+    return fcl.CollisionObject(fcl.Convex(part.vertices, len(part.faces), faces.ravel()))
+
+
+class Shapes:
+    """Fine convex parts of the assets of a library, as many of each asset as a scene has. They are made once, and each
+    scene moves them: FCL never frees all of a part.
+    """
+
+    def __init__(self, assets: Iterable[Asset]) -> None:
+        self._assets = list(assets)
+        self._copies: list[list[list[fcl.CollisionObject]]] = [[] for _ in self._assets]
+
+    def place(
+        self, categories: Sequence[int], rotations: Array, translations: Array
+    ) -> list[list[fcl.CollisionObject]]:
+        """Parts of the n objects of a scene at finite rotations (n, 3, 3) and translations (n, 3) m. They stay there
+        until the next scene is placed.
+        """
+        used: Counter[int] = Counter()
+        placed = []
+        for category, rotation, translation in zip(categories, rotations, translations, strict=True):
+            copies, number = self._copies[category], used[category]
+            if number == len(copies):
+                copies.append([convex(part) for part in self._assets[category].fine])
+            used[category] += 1
+            pose = fcl.Transform(rotation, translation)
+            for part in copies[number]:
+                part.setTransform(pose)
+            placed.append(copies[number])
+        return placed
+
+
+class Broadphase:
+    """Placed parts in a tree of boxes."""
+
+    def __init__(self, parts: Iterable[fcl.CollisionObject]) -> None:
+        self._tree = fcl.DynamicAABBTreeCollisionManager()
+        self._tree.registerObjects(parts)
+        self._tree.setup()
+        self._last: list[fcl.CollisionObject] = []
+
+    def meets(self, part: fcl.CollisionObject) -> bool:
+        """Whether a placed part touches or overlaps any of these; the one met last is tried first."""
+        if self._last and fcl.collide(self._last[0], part):
+            return True
+        found: list[fcl.CollisionObject] = []
+        self._tree.collide(part, found, _until_contact)
+        self._last = found or self._last
+        return bool(found)
+
+
+def _until_contact(one: fcl.CollisionObject, part: fcl.CollisionObject, found: list[fcl.CollisionObject]) -> bool:
+    """Called with each part ``one`` of a tree whose box meets that of ``part``, until it answers True."""
+    if fcl.collide(one, part):
+        found.append(one)
+    return bool(found)
+
+
+def gap(one: fcl.CollisionObject, other: fcl.CollisionObject) -> float:
+    """Distance of two placed parts, m; 0 where they touch or overlap."""
+    return max(0.0, fcl.distance(one, other))  # FCL answers -1 where they overlap
