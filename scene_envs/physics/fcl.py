@@ -7,12 +7,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from functools import cache
+from itertools import chain
+from threading import Lock
 
 import fcl
 import numpy as np
 
-from scene_envs.arrays import Array
+from scene_envs.arrays import Array, Mask
 from scene_envs.assets.base import Asset, ConvexPart
+from scene_envs.physics.placement import Objects, PlacedObjects, object_boxes
 
 
 def convex(part: ConvexPart) -> fcl.CollisionObject:
@@ -23,12 +27,13 @@ def convex(part: ConvexPart) -> fcl.CollisionObject:
 
 class Shapes:
     """Fine convex parts of the assets of a library, as many of each asset as a scene has. They are made once, and each
-    scene moves them: FCL never frees all of a part.
+    scene moves them, because FCL never frees all of a part. Whoever places a scene holds ``lock`` while it is in use.
     """
 
     def __init__(self, assets: Iterable[Asset]) -> None:
         self._assets = list(assets)
         self._copies: list[list[list[fcl.CollisionObject]]] = [[] for _ in self._assets]
+        self.lock = Lock()
 
     def place(
         self, categories: Sequence[int], rotations: Array, translations: Array
@@ -48,6 +53,12 @@ class Shapes:
                 part.setTransform(pose)
             placed.append(copies[number])
         return placed
+
+
+@cache
+def shapes_of(assets: tuple[Asset, ...]) -> Shapes:
+    """The parts of ``assets``, made on first use and shared by all threads of this process."""
+    return Shapes(assets)
 
 
 class Broadphase:
@@ -79,3 +90,38 @@ def _until_contact(one: fcl.CollisionObject, part: fcl.CollisionObject, found: l
 def gap(one: fcl.CollisionObject, other: fcl.CollisionObject) -> float:
     """Distance of two placed parts, m; 0 where they touch or overlap."""
     return max(0.0, fcl.distance(one, other))  # FCL answers -1 where they overlap
+
+
+def smallest_gaps(shapes: Shapes, objects: Objects, placed: PlacedObjects, ignored: Mask, limit: float) -> Array:
+    """(n,) m: distance of each object of one scene to its nearest neighbour, at most ``limit``; 0 where they touch or
+    overlap. ``placed`` are the fine parts of the ``objects``; pairs in ``ignored`` (n, n) and of two fixed objects do
+    not count.
+    """
+    nearest = np.full(len(objects), limit)
+    apart = _box_gaps(*object_boxes(placed))
+    first, second = np.nonzero(np.triu(~(ignored | ignored.T | (objects.fixed[:, None] & objects.fixed)), 1))
+    near = apart[first, second] < limit
+    first, second = first[near], second[near]
+    with shapes.lock:
+        parts = list(chain(*shapes.place(objects.category.tolist(), objects.rotation, objects.translation)))
+        for pair in np.argsort(apart[first, second], kind="stable"):
+            a, b = first[pair], second[pair]
+            least = max(nearest[a], nearest[b])  # only a smaller gap matters
+            if apart[a, b] >= least:
+                continue
+            rows, columns = (slice(placed.start[i], placed.start[i] + placed.count[i]) for i in (a, b))
+            boxes = _box_gaps(placed.low[rows], placed.high[rows], placed.low[columns], placed.high[columns])
+            for index in np.argsort(boxes, axis=None, kind="stable"):
+                i, j = divmod(int(index), boxes.shape[1])
+                if boxes[i, j] >= least:
+                    break
+                least = min(least, gap(parts[rows.start + i], parts[columns.start + j]))
+            nearest[[a, b]] = np.minimum(nearest[[a, b]], least)
+    return nearest
+
+
+def _box_gaps(low: Array, high: Array, other_low: Array | None = None, other_high: Array | None = None) -> Array:
+    """(n, m) m: distances of boxes (n, 3) to other boxes (m, 3), or to each other."""
+    other_low, other_high = low if other_low is None else other_low, high if other_high is None else other_high
+    between = np.maximum(low[:, None] - other_high, other_low - high[:, None])
+    return np.linalg.norm(np.maximum(between, 0.0), axis=-1)  # type: ignore[no-any-return]

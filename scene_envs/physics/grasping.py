@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain, product
-from threading import Lock
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from scene_envs.arrays import Array, Index, Mask
 from scene_envs.assets.base import AssetLibrary, ConvexPart
 from scene_envs.assets.shapes import box
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics.fcl import Broadphase, Shapes, convex
+from scene_envs.physics.fcl import Broadphase, convex, shapes_of
 from scene_envs.scene import SceneBatch, require_rigid_poses
 
 TOUCHING = 1e-4
@@ -98,17 +97,16 @@ class _Hand:
 
     def __init__(self, library: AssetLibrary, gripper: Gripper) -> None:
         self.gripper = gripper
-        self.shapes = Shapes(library)
+        self.shapes = shapes_of(library.assets)
         self.corners = [np.concatenate([part.vertices for part in asset.fine]) for asset in library]
         self.body = [convex(part) for part in gripper.body()]
         self.grasp = convex(gripper.grasp())
-        self._lock = Lock()  # threads share the hand and its shapes
 
     def reach(self, category: Index, rotation: Array, translation: Array, free: Index, back: Array) -> Mask:
         """(A, n) whether the gripper reaches the n objects of one scene from the directions ``back`` (A, 3); it is
         tried at those of the rows ``free``.
         """
-        with self._lock:
+        with self.shapes.lock:
             return self._reach(category, rotation, translation, free, back)
 
     def _reach(self, category: Index, rotation: Array, translation: Array, free: Index, back: Array) -> Mask:

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from fcl import Transform
 from scipy.spatial.transform import Rotation
+from trimesh import creation
 
+from scene_envs.assets.base import ConvexPart
 from scene_envs.assets.shapes import box
 from scene_envs.physics.fcl import Broadphase, Shapes, convex, gap
 from tests.helpers.import_graph import FILES
@@ -37,6 +39,17 @@ def test_gap_of_an_edge() -> None:
     """A cube turned by 45 degrees reaches half its diagonal."""
     one, other = cubes((0, 0, 0), (0.15, 0, 0), yaw=np.pi / 4)
     assert gap(one, other) == pytest.approx(0.15 - SIDE / 2 - SIDE / 2**0.5, abs=1e-6)
+
+
+def test_gap_of_a_ball() -> None:
+    """From a corner of a polyhedron in a ball of 5 cm, along the axis through it, to a box."""
+    corner = creation.icosphere(subdivisions=3, radius=0.05)
+    ball = convex(ConvexPart(np.array(corner.vertices), np.array(corner.faces)))
+    axis = corner.vertices[0] / 0.05
+    wall = convex(box((1.0, 1.0, SIDE)))  # its base is at z = 0
+    turn = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    wall.setTransform(Transform(turn, 0.08 * axis))
+    assert gap(ball, wall) == pytest.approx(0.03, abs=1e-6)
 
 
 def test_a_tree_forgets_nothing() -> None:
