@@ -82,6 +82,7 @@ PICTURES = {
     "relation": Picture(STEAMERS, "dimsum_table", 0.0, "spoken of", credited),
     "prompt_match": Picture(NAMED, "dimsum_table"),
     "reachability": Picture("reachability", "dimsum_table", 0.0, "not reached", without_credit),
+    "clearance": Picture("clearance", "dimsum_table", 0.01, "crowded", lambda b, o: o.object_flags["crowded"]),
     "coverage": Picture("coverage", "pantry_shelf"),
     "diversity": Picture("diversity", "breakfast_table_low_clutter"),
     "realism": Picture("realism", "dimsum_table", 0.01),

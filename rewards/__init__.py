@@ -15,6 +15,7 @@ from rewards.base import (
     learned_parts,
 )
 from rewards.check import check_reward
+from rewards.clearance import Clearance
 from rewards.clutter import Clutter
 from rewards.composite import Clip, Gate, Product, WeightedSum
 from rewards.counts import CategoryCount, ObjectCount
@@ -41,6 +42,7 @@ from rewards.registry import (
 
 __all__ = [
     "CategoryCount",
+    "Clearance",
     "Clip",
     "Clutter",
     "Coverage",

@@ -25,8 +25,7 @@ class Reachability:
 
     The gripper moves in a straight line from above or from the front, until some of the object is between its fingers
     (:func:`scene_envs.physics.grasping.reachable`). Whether the grasp would hold is not tested. Objects outside the
-    workspace are not reachable; a scene without free objects scores 0. A scene is invalid if the trials of a heap in it
-    would take too long.
+    workspace are not reachable; a scene without free objects scores 0.
 
     Attributes:
         sides: ``"above"``, ``"front"`` (the side of the scene type's camera, level) or both; one side is enough.
@@ -63,8 +62,8 @@ class Reachability:
         from scene_envs.physics.grasping import reachable
 
         approach = {"above": (0.0, 0.0, 1.0), "front": tuple(viewer_axes(batch.scene_type)[1].tolist())}
-        result = reachable(batch, [approach[side] for side in self.sides], self._gripper())
-        found = result.reached & batch.is_free & batch.in_workspace
+        found = reachable(batch, [approach[side] for side in self.sides], self._gripper())
+        found &= batch.is_free & batch.in_workspace
         reached = found.any(dim=0)
         free, number = batch.is_free.sum(dim=-1).float(), reached.sum(dim=-1).float()
         terms = {f"from_{side}": found[index].sum(dim=-1).float() for index, side in enumerate(self.sides)}
@@ -72,7 +71,6 @@ class Reachability:
             value=number / free.clamp(min=1),
             per_object=reached.float(),
             terms={"free_objects": free, "reachable_objects": number, **terms},
-            valid=result.valid,
             object_flags={"reachable": reached},
         )
 

@@ -74,6 +74,15 @@ class Holding:
         support, inside, place = pointers
         return Holding(support, self.contained[rows], inside, place, self.tier[rows])
 
+    def carries(self) -> Mask:
+        """(n, n) bool: whether each object carries each other one, directly or through others."""
+        found = np.zeros((len(self.support), len(self.support)), dtype=bool)
+        below, upper = self.support, np.arange(len(self.support))
+        while len(upper := upper[below[upper] >= 0]):
+            found[below[upper], upper] = True
+            below = np.where(below >= 0, self.support[below], -1)
+        return found
+
 
 @dataclass(frozen=True, eq=False)
 class Contacts:

@@ -5,29 +5,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 import torch
+from fcl import Transform
 from torch import Tensor
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart
+from scene_envs.assets.base import AssetLibrary, ConvexPart
 from scene_envs.assets.shapes import box
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics.collision import Collider
-from scene_envs.physics.parts import library_geometry
-from scene_envs.physics.placement import Budget, Objects, flatten, object_boxes, part_pairs, place, separations
-from scene_envs.scene import SceneBatch
+from scene_envs.physics.fcl import Broadphase, convex, shapes_of
+from scene_envs.scene import SceneBatch, require_rigid_poses
 
 TOUCHING = 1e-4
-"""Overlap (m) of the gripper with an object up to which it only touches the object."""
+"""The gripper's boxes are smaller by this (m) on each side, so that it may touch objects."""
 TURNS = tuple(np.arange(4) * np.pi / 4)
 """Angles (rad) of the closing direction about the approach, counted from an axis of the object."""
 PLACES = (0.5, 0.0, 1.0)
 """Grasp positions as fractions of the object's extent in the closing direction: its middle, then its two edges."""
-PART_PAIRS = 35_000.0
-"""Limit of pairs of convex parts tested per scene: six times the number of a crowded scene, about 0.6 s."""
 
 
 @dataclass(frozen=True)
@@ -56,134 +53,101 @@ class Gripper:
             raise InvalidInputError(f"{self}: reaches {self.reaches} must not be longer than the fingers")
 
     def body(self) -> tuple[ConvexPart, ...]:
-        """The two fingers, and the palm with its path; x is the closing direction, z points back from the tips."""
+        """The two fingers, and the palm with its path; x is the closing direction, z points back from the tips. Boxes
+        are smaller by :data:`TOUCHING` on each side.
+        """
         aside = 0.5 * (self.opening + self.finger_thickness)
         finger = (self.finger_thickness, self.finger_width, self.finger_length)
         palm = (*self.palm, self.path)
-        return box(finger, (-aside, 0, 0)), box(finger, (aside, 0, 0)), box(palm, (0, 0, self.finger_length))
+        return _inner(palm, (0, 0, self.finger_length)), _inner(finger, (-aside, 0, 0)), _inner(finger, (aside, 0, 0))
 
     def grasp(self) -> ConvexPart:
-        """The space between the fingers."""
-        return box((self.opening, self.finger_width, self.finger_length))
+        """The space between the fingers, smaller by :data:`TOUCHING` on each side."""
+        return _inner((self.opening, self.finger_width, self.finger_length), (0, 0, 0))
 
 
-@dataclass(frozen=True, eq=False)
-class ReachResult:
-    """Objects that a gripper reaches."""
-
-    reached: Tensor  # (A, B, N) bool, for each approach; False for welded and empty slots
-    valid: Tensor  # (B,) bool; False for scenes, such as heaps, of too much work
-
-
-def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper: Gripper | None = None) -> ReachResult:
-    """Objects of B scenes that an open gripper reaches in a straight line without touching anything.
+def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper: Gripper | None = None) -> Tensor:
+    """(A, B, N) bool: objects of B scenes that an open gripper reaches in a straight line without touching anything;
+    False for welded and empty slots.
 
     For each of A ``approaches``, directions in the world from the object to the waiting gripper, such as (0, 0, 1), it
     is tried at the middle and both edges of the object, with four closing directions and all reaches. It reaches the
-    object when a part of it is between the fingers, and fingers, palm and the palm's path overlap no object by more
-    than 0.1 mm (fine convex parts, exact depths).
+    object when a fine convex part of it is between the fingers, and none of any object is in the fingers, the palm or
+    the palm's path, whose boxes are smaller by 0.1 mm on each side (:mod:`scene_envs.physics.fcl`).
+
+    Raises InvalidInputError for a matrix that is not a rotation; the message names its scene and slot.
     """
+    require_rigid_poses(batch)
     gripper = Gripper() if gripper is None else gripper
     found = torch.zeros(len(approaches), *batch.tensor.shape[:2], dtype=torch.bool)
-    valid = torch.ones(len(batch), dtype=torch.bool)
-    categories = batch.categories.cpu().numpy()
     translations = batch.translations.double().cpu().numpy()
     rotations = batch.rotations.double().cpu().numpy()
-    welded = batch.is_welded.cpu().numpy()
+    categories, free = batch.categories.cpu().numpy(), batch.is_free.cpu().numpy()
+    back = np.asarray(approaches, dtype=np.float64)
     hand = _hand(batch.scene_type.library, gripper)
-    for row in range(len(batch)):
-        rows = slice(row, row + 1)
-        objects = flatten(hand.collider.library, translations[rows], rotations[rows], categories[rows], welded[rows])
-        objects = objects[np.flatnonzero(categories[row, objects.slot] < batch.scene_type.num_assets)]
-        budget = Budget(PART_PAIRS)
-        for index, approach in enumerate(approaches):
-            met = hand.reach(objects, np.asarray(approach, dtype=np.float64), budget)
-            found[index, row, objects.slot[met]] = True
-        valid[row] = not budget.is_spent
-    device = batch.tensor.device
-    return ReachResult((found & valid[:, None]).to(device), valid.to(device))
+    for row, slots in enumerate(map(np.flatnonzero, categories < batch.scene_type.num_assets)):
+        poses = rotations[row, slots], translations[row, slots]
+        met = hand.reach(categories[row, slots], *poses, np.flatnonzero(free[row, slots]), back)
+        found[:, row, slots] = torch.from_numpy(met)
+    return found.to(batch.tensor.device)
 
 
 class _Hand:
-    """A gripper with the assets of a library; the last two assets are the gripper and its space for a grasp."""
+    """A gripper among the assets of a library, for one scene at a time."""
 
     def __init__(self, library: AssetLibrary, gripper: Gripper) -> None:
         self.gripper = gripper
-        self.body, self.grasp = len(library), len(library) + 1
-        tools = (_tool("gripper", gripper.body()), _tool("grasp", (gripper.grasp(),)))
-        self.collider = Collider(library_geometry((*library.assets, *tools)))
+        self.shapes = shapes_of(library.assets)
         self.corners = [np.concatenate([part.vertices for part in asset.fine]) for asset in library]
+        self.body = [convex(part) for part in gripper.body()]
+        self.grasp = convex(gripper.grasp())
 
-    def reach(self, objects: Objects, back: Array, budget: Budget) -> Index:
-        """Rows of the free objects of one scene that the gripper reaches from the direction ``back`` (3,). ``budget``
-        counts pairs of convex parts; when it is spent, the result is not valid.
+    def reach(self, category: Index, rotation: Array, translation: Array, free: Index, back: Array) -> Mask:
+        """(A, n) whether the gripper reaches the n objects of one scene from the directions ``back`` (A, 3); it is
+        tried at those of the rows ``free``.
         """
-        free = np.flatnonzero(~objects.fixed)
-        if not len(free):
-            return free
-        owner, rotation, low, high = self._extents(objects, free, back / np.linalg.norm(back))
-        open_rows = free
-        for place_along, reach in product(PLACES, self.gripper.reaches):
-            if budget.is_spent:
-                return free[:0]
-            tried = np.flatnonzero(np.isin(owner, open_rows))
-            across = low[tried, 0] + place_along * (high[tried, 0] - low[tried, 0])
-            deep = np.maximum(high[tried, 2] - reach, low[tried, 2])
-            tips = np.stack([across, 0.5 * (low[tried, 1] + high[tried, 1]), deep], axis=1)
-            tips = np.einsum("gij,gj->gi", rotation[tried], tips)
-            good = self._succeed(objects, owner[tried], rotation[tried], tips, budget)
-            open_rows = np.setdiff1d(open_rows, owner[tried[good]])
-        return np.setdiff1d(free, open_rows)
+        with self.shapes.lock:
+            return self._reach(category, rotation, translation, free, back)
 
-    def _extents(self, objects: Objects, rows: Index, back: Array) -> tuple[Index, Array, Array, Array]:
-        """Gripper frames for some objects: owner (G,), rotation (G, 3, 3) to the world, and the owner's lowest and
-        highest coordinates (G, 3), (G, 3) m along the axes of the gripper.
+    def _reach(self, category: Index, rotation: Array, translation: Array, free: Index, back: Array) -> Mask:
+        placed = self.shapes.place(category.tolist(), rotation, translation)
+        scene, own = Broadphase(chain(*placed)), [Broadphase(placed[row]) for row in free]
+        corners = [self.corners[category[row]] @ rotation[row].T + translation[row] for row in free]
+        reached = np.zeros((len(back), len(category)), dtype=bool)
+        for side, direction in enumerate(back / np.linalg.norm(back, axis=1, keepdims=True)):
+            frames = _frames(rotation[free], direction)
+            trials = zip(frames, self._tips(corners, frames), own, strict=True)
+            reached[side, free] = [self._reaches(*trial, scene) for trial in trials]
+        return reached
+
+    def _tips(self, corners: list[Array], frames: Array) -> Array:
+        """(n, P, T, 3) m: places of the tips at n objects, from the corners (V, 3) m of each in the world and the
+        frames (n, T, 3, 3) of the gripper.
         """
-        rotation = _frames(objects.rotation[rows], back)  # (n, T, 3, 3)
-        low, high = np.empty(rotation.shape[:3]), np.empty(rotation.shape[:3])
-        for index, row in enumerate(rows.tolist()):
-            points = self.corners[objects.category[row]] @ objects.rotation[row].T + objects.translation[row]
-            along = points @ rotation[index]  # (T, V, 3)
-            low[index], high[index] = along.min(axis=1), along.max(axis=1)
-        owner = np.repeat(rows, len(TURNS))
-        return owner, rotation.reshape(-1, 3, 3), low.reshape(-1, 3), high.reshape(-1, 3)
+        along = [points @ turned for points, turned in zip(corners, frames, strict=True)]  # (T, V, 3) each
+        bounds = np.array([(points.min(axis=1), points.max(axis=1)) for points in along]).reshape(-1, 2, len(TURNS), 3)
+        low, high = bounds[:, 0, None], bounds[:, 1, None]  # (n, 1, T, 3)
+        part, reach = np.array(list(product(PLACES, self.gripper.reaches))).T[..., None]  # (P, 1) each
+        across = low[..., 0] + part * (high[..., 0] - low[..., 0])  # (n, P, T)
+        deep = np.maximum(high[..., 2] - reach, low[..., 2])
+        middle = np.broadcast_to(0.5 * (low[..., 1] + high[..., 1]), deep.shape)
+        return np.einsum("ntij,nptj->npti", frames, np.stack([across, middle, deep], axis=-1))
 
-    def _succeed(self, objects: Objects, owner: Index, rotation: Array, translation: Array, budget: Budget) -> Index:
-        """Rows of the G poses at which part of the object is between the fingers and the gripper overlaps nothing."""
-        left = np.arange(len(owner))
-        for tool, wanted in ((self.grasp, True), (self.body, False)):
-            both = _concatenate(objects, tool, rotation[left], translation[left])
-            first = len(objects) + np.arange(len(left))
-            left = left[self._overlap(both, first, owner[left], budget) == wanted]
-        return left[~self._is_blocked(objects, rotation[left], translation[left], budget)]
-
-    def _is_blocked(self, objects: Objects, rotation: Array, translation: Array, budget: Budget) -> Mask:
-        """(G,) whether the gripper overlaps anything."""
-        both = _concatenate(objects, self.body, rotation, translation)
-        count, total = len(objects), len(both)
-        low, high = object_boxes(place(self.collider.library, both, "fine"))
-        near = ((low[count:, None] < high[None, :count]) & (low[None, :count] < high[count:, None])).all(axis=-1)
-        first, second = np.nonzero(near)
-        blocked = np.zeros(total - count, dtype=bool)
-        blocked[first[self._overlap(both, first + count, second, budget)]] = True
-        return blocked
-
-    def _overlap(self, objects: Objects, first: Index, second: Index, budget: Budget) -> Mask:
-        """(P,) whether two objects overlap by more than :data:`TOUCHING`."""
-        placed = place(self.collider.library, objects, "fine")
-        pair, a, b = part_pairs(placed, first, second)
-        near = ((placed.low[a] < placed.high[b]) & (placed.low[b] < placed.high[a])).all(axis=-1)
-        pair, a, b = pair[near], a[near], b[near]
-        overlap = np.zeros(len(first), dtype=bool)
-        budget.spent += len(pair)
-        if budget.is_spent:
-            return overlap
-        gap, _ = separations(self.collider.library, placed.parts, a, b)
-        deep = gap < -TOUCHING
-        pair, a, b = pair[deep], a[deep], b[deep]
-        depth, _ = self.collider.depth(placed.parts, a, b)
-        overlap[pair[depth > TOUCHING]] = True
-        return overlap
+    def _reaches(self, frames: Array, tips: Array, own: Broadphase, scene: Broadphase) -> bool:
+        """Whether at one of the places ``tips`` (P, T, 3) m, turned as ``frames`` (T, 3, 3), one of the object's
+        ``own`` parts is between the fingers, and the gripper meets nothing of the scene.
+        """
+        for places in tips:
+            for rotation, place in zip(frames, places, strict=True):
+                pose = Transform(rotation, place)
+                self.grasp.setTransform(pose)
+                if not own.meets(self.grasp):
+                    continue
+                for part in self.body:
+                    part.setTransform(pose)
+                if not any(map(scene.meets, self.body)):
+                    return True
+        return False
 
 
 _hand = lru_cache(maxsize=16)(_Hand)
@@ -205,13 +169,7 @@ def _frames(rotation: Array, back: Array) -> Array:
     return np.stack([closing, np.cross(back, closing), np.broadcast_to(back, closing.shape)], axis=-1)
 
 
-def _concatenate(objects: Objects, category: int, rotation: Array, translation: Array) -> Objects:
-    """The objects of one scene, followed by G tools."""
-    scene = np.zeros(len(rotation), dtype=np.int64)
-    return objects + Objects(scene, scene - 1, scene + category, rotation, translation, scene > 0)
-
-
-def _tool(name: str, parts: tuple[ConvexPart, ...]) -> Asset:
-    """Convex parts as an asset without mass, for collisions alone."""
-    zero = np.zeros(3)
-    return Asset(name, name, name, 0.0, zero, np.zeros((3, 3)), None, parts, parts, (0, 0, 0), True)  # type: ignore[arg-type]
+def _inner(size: tuple[float, float, float], base: tuple[float, float, float]) -> ConvexPart:
+    """A box of this size (m) above ``base``, smaller by :data:`TOUCHING` on each side."""
+    x, y, z = (length - 2 * TOUCHING for length in size)
+    return box((x, y, z), (base[0], base[1], base[2] + TOUCHING))

@@ -14,7 +14,7 @@ from scene_envs.arrays import Array, Index
 from scene_envs.physics.collision import TOO_MANY, corner_tests
 from scene_envs.physics.engines import Course
 from scene_envs.physics.motion import Physics, motion, physics_of, settle_scene
-from scene_envs.physics.placement import Budget, ObjectPairs, Objects, flatten, simulation_units
+from scene_envs.physics.placement import Budget, ObjectPairs, Objects, flatten, place, simulation_units
 from scene_envs.physics.projection import TOLERANCE, heaps, project_objects
 from scene_envs.scene_types import SceneType
 
@@ -151,6 +151,26 @@ def furniture_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
     return {"depth": _scatter(chunk, welded, depth), "valid": valid}
 
 
+def gaps_kernel(chunk: Chunk, *, engine: str, limit: float) -> dict[str, Any]:
+    """Gap (m, at most ``limit``) of each object to the nearest one that does not carry it and that it does not carry,
+    directly or through others.
+    """
+    import torch  # the other kernels run in processes without torch
+
+    from scene_envs.physics.fcl import shapes_of, smallest_gaps
+    from scene_envs.supports import Contacts, Placed
+
+    physics, objects, valid = _start(chunk, engine)
+    poses = map(torch.from_numpy, (chunk.categories, chunk.translations, chunk.rotations))
+    outlines, standing, _ = Placed.of_scenes(chunk.scene_type, *poses)
+    carries = Contacts.of(outlines, standing).holding().carries()
+    shapes, found = shapes_of(chunk.scene_type.library.assets), np.zeros(len(objects))
+    for rows in (np.flatnonzero(objects.scene == index) for index in range(len(chunk))):
+        placed = place(physics.library, objects[rows], "fine")
+        found[rows] = smallest_gaps(shapes, objects[rows], placed, carries[np.ix_(rows, rows)], limit)
+    return {"gap": _scatter(chunk, objects, found), "valid": valid}
+
+
 def settle_kernel(chunk: Chunk, *, engine: str, duration: float, iterations: int) -> dict[str, Any]:
     """See :func:`scene_envs.physics.settle`."""
     translations, rotations, valid = chunk.translations.copy(), chunk.rotations.copy(), np.ones(len(chunk), dtype=bool)
@@ -220,6 +240,7 @@ KERNELS: dict[str, Callable[..., dict[str, Any]]] = {
     "equilibrium": equilibrium_kernel,
     "penetration": penetration_kernel,
     "furniture": furniture_kernel,
+    "gaps": gaps_kernel,
     "project": projection_kernel,
     "settle": settle_kernel,
     "units": units_kernel,

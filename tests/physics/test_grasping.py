@@ -1,17 +1,21 @@
-"""Approaches of a gripper: hand-made scenes, and collisions against FCL."""
+"""Approaches of a gripper: hand-made scenes, and contacts against exact depths."""
 
 from __future__ import annotations
 
-import fcl
+from itertools import chain
+
 import numpy as np
 import pytest
 import torch
+from fcl import Transform
 from scipy.spatial.transform import Rotation
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
-from scene_envs.physics.grasping import Gripper, _hand, reachable
-from scene_envs.physics.placement import Budget, flatten
+from scene_envs.physics.collision import PenetrationDepth
+from scene_envs.physics.fcl import Broadphase, Shapes, convex
+from scene_envs.physics.grasping import TOUCHING, Gripper, reachable
+from scene_envs.physics.placement import PlacedParts
 from scene_envs.scene import SceneBatch
 from tests.helpers.simple_scenes import SIDE, scene
 
@@ -21,7 +25,7 @@ WIDE = Gripper(opening=SIDE + 0.02)
 
 def reached(batch: SceneBatch, approach: tuple[float, float, float], gripper: Gripper = WIDE) -> list[bool]:
     """Verdicts on the free objects of one scene."""
-    return reachable(batch, [approach], gripper).reached[0, 0][batch.is_free[0]].tolist()
+    return reachable(batch, [approach], gripper)[0, 0][batch.is_free[0]].tolist()
 
 
 def test_a_box_is_grasped_when_it_fits_between_the_fingers() -> None:
@@ -29,7 +33,7 @@ def test_a_box_is_grasped_when_it_fits_between_the_fingers() -> None:
     assert reached(alone, UP) == [True]
     assert reached(alone, UP, Gripper(opening=SIDE - 0.01)) == [False]
     assert reached(alone, UP, Gripper(opening=SIDE + 1e-3)) == [True]
-    assert not bool(reachable(alone, [UP]).reached[0, 0, 0])  # the floor is welded
+    assert not bool(reachable(alone, [UP])[0, 0, 0])  # the floor is welded
 
 
 def test_neighbours_bar_the_fingers_only_where_there_is_no_room() -> None:
@@ -66,62 +70,53 @@ def test_rims_are_grasped_and_flat_things_down_to_the_floor() -> None:
 def test_verdicts_depend_neither_on_the_batch_nor_on_the_heading() -> None:
     batch = get_grammar("pantry_shelf").sample(np.random.default_rng(0), 2)
     batch = SceneBatch(batch.tensor[:, :24], batch.scene_type)
-    together = reachable(batch, [UP, FRONT]).reached
-    alone = reachable(batch[1], [UP, FRONT]).reached
+    together = reachable(batch, [UP, FRONT])
+    alone = reachable(batch[1], [UP, FRONT])
     assert torch.equal(together[:, 1:], alone)
     assert 0 < int(together.any(dim=0).sum()) < int(batch.is_free.sum())
 
 
 @pytest.mark.slow
-def test_a_heap_is_invalid_and_leaves_the_others_alone() -> None:
-    """Sixty objects of many parts at one point take many times the work of a crowded scene."""
+def test_a_heap_has_an_answer_and_leaves_the_others_alone() -> None:
+    """Sixty objects of many parts within 5 cm, and one 10 km away."""
     clean = get_grammar("pantry_shelf").sample(np.random.default_rng(0), 1)
     parts = torch.tensor([len(asset.fine) for asset in clean.scene_type.library.assets])
     categories = torch.where(clean.is_welded, clean.categories, parts.argmax())
     spread = torch.linspace(0.0, 0.05, clean.tensor.shape[1])[None, :, None]
     translations = torch.where(clean.is_welded[..., None], clean.translations, torch.tensor([0.0, 0.0, 0.8]) + spread)
+    translations[0, -1] = 1e4
     heap = SceneBatch.from_parts(translations, torch.eye(3).expand_as(clean.rotations), categories, clean.scene_type)
-    both = SceneBatch(torch.cat([heap.tensor, clean.tensor]), clean.scene_type)
-    result = reachable(both, [UP])
-    assert result.valid.tolist() == [False, True]
-    assert not bool(result.reached[:, 0].any())
-    assert torch.equal(result.reached[:, 1], reachable(clean, [UP]).reached[:, 0])
+    both = reachable(SceneBatch(torch.cat([heap.tensor, clean.tensor]), clean.scene_type), [UP])
+    assert torch.equal(both[:, 0], reachable(heap, [UP])[:, 0])
+    assert torch.equal(both[:, 1], reachable(clean, [UP])[:, 0])
+    assert not bool((both & ~torch.cat([heap.is_free, clean.is_free])).any())
 
 
-def test_collisions_of_the_gripper_are_those_of_fcl() -> None:
+def test_the_gripper_meets_what_is_deeper_than_a_tenth_of_a_millimetre() -> None:
+    """Exact depths say the same, but for depths from 0.1 mm to 0.1 mm times the root of 3: the corner of a box."""
     batch = get_grammar("dimsum_table").sample(np.random.default_rng(1), 1)
-    hand = _hand(batch.scene_type.library, Gripper())
-    poses = (batch.translations.double().numpy(), batch.rotations.double().numpy())
-    objects = flatten(hand.collider.library, *poses, batch.categories.numpy(), batch.is_welded.numpy())
-    objects = objects[np.flatnonzero(objects.category < hand.body)]
-    rng = np.random.default_rng(0)
-    rotation = Rotation.random(150, random_state=0).as_matrix()
-    translation = rng.uniform((-0.5, -0.5, 0.0), (0.5, 0.5, 0.25), (150, 3))
-    blocked = hand._is_blocked(objects, rotation, translation, Budget(float("inf")))
-    assert 10 < int(blocked.sum()) < 140
-
-    def shape(part: object) -> fcl.Convex:
-        faces = np.concatenate([np.full((len(part.faces), 1), 3), part.faces], axis=1).ravel()  # type: ignore[attr-defined]
-        return fcl.Convex(part.vertices, len(part.faces), faces)  # type: ignore[attr-defined]
-
-    bodies = [shape(part) for part in Gripper().body()]
-    library = batch.scene_type.library
-    things = [
-        fcl.CollisionObject(shape(part), fcl.Transform(objects.rotation[row], objects.translation[row]))
-        for row in range(len(objects))
-        for part in library[int(objects.category[row])].fine
-    ]
-    for index in range(150):
-        pose = fcl.Transform(rotation[index], translation[index])
-        body = [fcl.CollisionObject(part, pose) for part in bodies]
-        deepest = 0.0
+    batch = SceneBatch(batch.tensor[:, ~batch.is_empty[0]], batch.scene_type)
+    library, gripper = batch.scene_type.library, Gripper()
+    categories = batch.categories[0].tolist()
+    rotations, translations = batch.rotations[0].double().numpy(), batch.translations[0].double().numpy()
+    tree = Broadphase(chain(*Shapes(library).place(categories, rotations, translations)))
+    owner = [row for row, category in enumerate(categories) for _ in library[category].fine]
+    whole = [part.vertices + TOUCHING * np.sign(part.vertices - part.vertices.mean(axis=0)) for part in gripper.body()]
+    depth = PenetrationDepth([*whole, *(part.vertices for category in categories for part in library[category].fine)])
+    first, second = (index.ravel() for index in np.meshgrid(np.arange(3), 3 + np.arange(len(owner))))
+    places = np.random.default_rng(0).uniform((-0.5, -0.5, 0.0), (0.5, 0.5, 0.25), (150, 3))
+    body, found = [convex(part) for part in gripper.body()], []
+    for turn, place in zip(Rotation.random(150, random_state=0).as_matrix(), places, strict=True):
         for part in body:
-            for thing in things:
-                request, result = fcl.CollisionRequest(enable_contact=True), fcl.CollisionResult()
-                if fcl.collide(part, thing, request, result):
-                    deepest = max(deepest, max(contact.penetration_depth for contact in result.contacts))
-        if deepest == 0.0 or deepest > 1e-3:  # what barely touches is left out
-            assert bool(blocked[index]) is (deepest > 0.0)
+            part.setTransform(Transform(turn, place))
+        found.append(any(map(tree.meets, body)))
+        turns = np.concatenate([np.broadcast_to(turn, (3, 3, 3)), rotations[owner]])
+        placed = PlacedParts(
+            np.arange(3 + len(owner)), turns, np.concatenate([np.broadcast_to(place, (3, 3)), translations[owner]])
+        )
+        deepest = depth(placed, first, second)[0].max()
+        assert TOUCHING < deepest < 3**0.5 * TOUCHING or found[-1] is bool(deepest > TOUCHING)
+    assert 10 < sum(found) < 140
 
 
 @pytest.mark.parametrize("wrong", [{"opening": 0.0}, {"palm": (0.05, 0.06)}, {"reaches": (0.1,)}, {"reaches": ()}])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import trimesh
 
 from rewards import (
     CategoryCount,
+    Clearance,
     Clutter,
     Coverage,
     Diversity,
@@ -30,7 +32,16 @@ from scene_envs import SceneBatch, get_grammar, get_scene_type
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 COMPOSITES = {"clip", "gate", "product", "weighted_sum"}
-SHELF = ["clutter", "penetration", "stability", "category_count", "coverage", "diversity", "feasible_share"]
+SHELF = [
+    "clearance",
+    "clutter",
+    "penetration",
+    "stability",
+    "category_count",
+    "coverage",
+    "diversity",
+    "feasible_share",
+]
 
 
 def place(*objects: tuple[str, float, float, float], kind: str = "dimsum_table", slots: int = 8) -> SceneBatch:
@@ -140,6 +151,69 @@ def test_stability_falls_with_the_movement() -> None:
     assert output.terms["simulated_objects"].item() == 2
     assert output.terms["moved_mm"].item() == pytest.approx(1.5, abs=0.01)
     assert score(Stability(), SceneBatch.empty("dimsum_table", 1)).value.item() == 0.0
+
+
+# -- clearance ---------------------------------------------------------------------------------------
+
+
+def games(*places: tuple[float, float, float], yaw: float = 0.0) -> SceneBatch:
+    """Board games (0.4 m along x, 0.265 m along y, 0.055 m high) in the air before a shelf; the last is turned."""
+    batch = place(*(("board_game_l", *position) for position in places), kind="living_room_shelf")
+    rotations = batch.rotations.clone()
+    rotations[0, len(places), :2, :2] = torch.tensor([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    return batch.with_poses(batch.translations, rotations)
+
+
+@pytest.mark.parametrize("gap", [0.2, 0.05, 0.03, 0.01, 0.0, -0.01, -0.265])
+def test_clearance_of_two_boxes(gap: float) -> None:
+    """The second is beside the first, in it, or at the same place."""
+    kind = get_scene_type("living_room_shelf")
+    low, high = np.array(kind.workspace)
+    x, z = high[0] + 0.5, 0.5 * (low[2] + high[2])
+    batch = games((x, -0.2, z), (x, -0.2 + 0.265 + gap, z))
+    wide = SceneBatch(batch.tensor, replace(kind, name="wide", workspace=((-2.0,) * 3, (2.0,) * 3)))
+    output = score(Clearance(wanted=0.06), wide)
+    share = min(max(gap, 0.0) / 0.06, 1.0)
+    assert output.per_object[0, :3].tolist() == pytest.approx([0.0, share, share], abs=1e-5)
+    assert output.value.item() == pytest.approx(share, abs=1e-5)
+    assert output.terms["smallest_gap"].item() == pytest.approx(0.06 * share, abs=1e-6)
+    assert output.terms["crowded_objects"].item() == 2 * (share < 1)
+    assert score(Clearance(wanted=0.06), batch).value.item() == 0.0  # outside the workspace
+
+
+def test_clearance_of_a_turned_box() -> None:
+    """Its corner reaches half its width and half its depth, at 45 degrees, toward the other box."""
+    batch = games((0.0, -0.3, 3.0), (0.0, 0.0, 3.0), yaw=math.pi / 4)
+    wide = SceneBatch(batch.tensor, replace(batch.scene_type, name="wide", workspace=((-5.0,) * 3, (5.0,) * 3)))
+    reach = 0.5 * (0.4 + 0.265) * math.sin(math.pi / 4)
+    expected = 0.3 - 0.5 * 0.265 - reach
+    assert expected < 0  # they overlap
+    assert score(Clearance(), wide).terms["smallest_gap"].item() == 0.0
+    apart = wide.with_poses(
+        wide.translations + torch.tensor([0.0, 0.1, 0.0]) * (torch.arange(8) == 2)[:, None], wide.rotations
+    )
+    assert score(Clearance(wanted=1.0), apart).per_object[0, 2].item() == pytest.approx(expected + 0.1, abs=1e-5)
+
+
+def test_what_carries_an_object_is_no_neighbour() -> None:
+    """A tower of steamers on the table has all the space, and a plate beside it the gap that there is."""
+    kind = get_scene_type("dimsum_table")
+    height = kind.library["steamer_bottom"].bounds[1, 2]
+    tower = [("steamer_bottom", 0.0, 0.0, level * height) for level in range(3)]
+    assert score(Clearance(), place(*tower)).per_object[0, 1:4].tolist() == [1.0, 1.0, 1.0]
+    floating = score(Clearance(wanted=0.1), place(("steamer_bottom", 0.0, 0.0, 0.05)))  # carried by nothing
+    assert floating.per_object[0, 1].item() == pytest.approx(0.5, abs=1e-5)
+    beside = score(Clearance(), place(*tower, ("steamer_bottom", 0.3, 0.0, 0.0)))
+    assert 0 < kind.library["steamer_bottom"].bounds[1, 0] < 0.135
+    assert beside.value.item() == 1.0
+    heap = [("steamer_bottom", 0.0, 0.001 * index, 0.2) for index in range(6)]
+    assert score(Clearance(), place(*heap)).value.item() == 0.0
+
+
+@pytest.mark.parametrize("wanted", [0.0, -1.0, math.inf, math.nan])
+def test_a_wanted_gap_is_positive(wanted: float) -> None:
+    with pytest.raises(InvalidInputError, match="wanted"):
+        Clearance(wanted=wanted)
 
 
 # -- kinds, coverage, diversity ----------------------------------------------------------------------
