@@ -89,13 +89,13 @@ def visible_triangles(triangles: Array, camera: Pinhole) -> tuple[Index, NDArray
     """
     corners, owners = _in_front(triangles, camera.near)
     points = camera.project(corners)
+    ends = (limit(limit(points[:, 0], points[:, 1]), points[:, 2])[:, :2] for limit in (np.minimum, np.maximum))
+    low, high = (np.ceil(np.clip(end, 0, (camera.width, camera.height)) - 0.5) for end in ends)
+    (kept,) = np.nonzero((high > low).all(axis=1))  # those around the centre of a pixel
+    points, owners, first = points[kept], owners[kept], low[kept, 1].astype(np.int64)
+    counts = high[kept, 1].astype(np.int64) - first
     order = np.argsort(points[..., 1], axis=1)
     points = np.take_along_axis(points, order[..., None], axis=1)  # from the top down
-    left, right = points[..., 0].min(axis=1), points[..., 0].max(axis=1)
-    first = np.ceil(np.clip(points[:, 0, 1], 0, camera.height) - 0.5).astype(np.int64)
-    last = np.ceil(np.clip(points[:, 2, 1], 0, camera.height) - 0.5).astype(np.int64)
-    (kept,) = np.nonzero((last > first) & (right > 0.5) & (left <= camera.width - 0.5))
-    points, owners, first, counts = points[kept], owners[kept], first[kept], (last - first)[kept]
 
     of, rows = _ranges(first, counts)
     spans = _spans(points, of, rows.astype(np.float64) + 0.5)
