@@ -21,7 +21,7 @@ from torch import Tensor
 
 from rewards.base import RewardContext, RewardOutput, declared_maximum, facts_of
 from rewards.registry import as_output, is_own, resolve_reward, reward_name
-from scene_envs.errors import RewardError
+from scene_envs.errors import MissingDependencyError, RewardError
 from scene_envs.protocols import SceneScorer
 from scene_envs.scene import SceneBatch
 
@@ -91,6 +91,7 @@ def evaluate_reward(
 
     Raises:
         RewardError: the reward failed, and ``strict`` is set.
+        MissingDependencyError: a reward of this package needs another one that is not installed.
 
     >>> evaluate_reward(lambda batch, context: batch.counts, SceneBatch.empty("dimsum_table", 2)).value
     tensor([1., 1.])
@@ -135,6 +136,8 @@ def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardO
             f"reward {name!r} called sys.exit({_text(error)}){_place(error.__traceback__)}; raise an error instead"
         ) from error
     except BaseException as error:
+        if own and isinstance(error, MissingDependencyError):
+            raise
         raise RewardError(f"reward {name!r} raised {describe_error(error)}{_place(error.__traceback__)}") from error
     finally:
         if os.getpid() != process:  # the reward forked this copy of the process, which must not continue the run

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
@@ -318,6 +318,7 @@ class EvaluationInputs:
     seed: int = 0  # of the classifiers and prompts
     fid_weights: str = ""  # path of the weights of an Inception-v3
     prompts: int | None = None  # number of real scenes whose prompts the samples follow; None for all
+    left_out: dict[str, str] = field(default_factory=dict)  # gets figures that this machine cannot compute, and why
 
 
 def compute_measure(name: str, inputs: EvaluationInputs) -> Figures:
@@ -381,7 +382,7 @@ def _novelty(inputs: EvaluationInputs) -> Figures:
 
 MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
     "layout": lambda inputs: _with_floor(lambda batch: layout_figures(batch, inputs.real.reference), inputs),
-    "physics": lambda inputs: _with_floor(lambda batch: physics_figures(batch, inputs.pool), inputs),
+    "physics": lambda inputs: _with_floor(lambda batch: physics_figures(batch, inputs.pool, inputs.left_out), inputs),
     "ready": lambda inputs: _with_floor(lambda batch: ready_figures(batch, inputs.pool), inputs),
     "fsd": lambda inputs: _with_floor(
         lambda batch: {"frechet_scene_distance": frechet_scene_distance(batch, inputs.real.reference)}, inputs

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import logging
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
     from scene_envs.physics import ObjectPair, PenetrationResult, PhysicsPool
+
+logger = logging.getLogger(__name__)
 
 CONTACT = 1e-5
 """Largest overlap (m) of hulls in contact; float32 poses are not more precise."""
@@ -23,7 +27,27 @@ DEEP = 1e-2
 """Overlap (m) above which objects are not simulated, because a simulator would throw them apart."""
 
 
-def physics_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[str, float]:
+@contextlib.contextmanager
+def leaving_out(name: str, left_out: dict[str, str]) -> Iterator[None]:
+    """Context of figures ``name`` that are left out where a package for them is not installed: the message of the
+    MissingDependencyError is logged and kept in ``left_out``.
+
+    >>> left_out: dict[str, str] = {}
+    >>> with leaving_out("feasible", left_out):
+    ...     raise MissingDependencyError("no simulator is installed")
+    >>> left_out
+    {'feasible': 'no simulator is installed'}
+    """
+    try:
+        yield
+    except MissingDependencyError as error:
+        left_out[name] = str(error)
+        logger.warning("%s left out: %s", name, error)
+
+
+def physics_figures(
+    batch: SceneBatch, pool: PhysicsPool | None = None, left_out: dict[str, str] | None = None
+) -> dict[str, float]:
     """Overlap, stability and feasibility of scenes as they are; docs/evaluation.md describes each figure.
 
     Scenes whose physics failed are left out of the figures of that computation.
@@ -31,8 +55,13 @@ def physics_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[
     Args:
         batch: scenes to measure.
         pool: worker processes; None computes in this process.
+        left_out: gets the reason under ``"feasible"`` where no simulator is installed, and stability and feasibility
+            are left out then; with None this raises a MissingDependencyError.
     """
-    return {**_overlap(batch, pool), **_furniture(batch, pool), **_feasibility(batch, pool)}
+    figures = {**_overlap(batch, pool), **_furniture(batch, pool)}
+    with contextlib.nullcontext() if left_out is None else leaving_out("feasible", left_out):
+        figures |= _feasibility(batch, pool)
+    return figures
 
 
 def ready_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[str, float]:
@@ -73,7 +102,7 @@ def stable_fraction(batch: SceneBatch, *, pool: PhysicsPool | None = None) -> fl
 
     Raises:
         InvalidInputError: no scene that the physics could judge holds a free object.
-        MissingDependencyError: pybullet is not installed.
+        MissingDependencyError: no simulator is installed.
     """
     from scene_envs.physics import feasibility
 

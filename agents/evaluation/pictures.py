@@ -111,7 +111,7 @@ def frechet_inception_distance(
         The distance, at least 0.
 
     Raises:
-        MissingDependencyError: torchvision or PyBullet is not installed.
+        MissingDependencyError: torchvision is not installed.
         InvalidInputError: the file does not exist, or a batch has fewer than two scenes.
         CorruptFileError: the file is not a state dict of such a network.
     """
@@ -227,7 +227,6 @@ def render_classifier_accuracy(
         Accuracy as a fraction; 0.5 is chance.
 
     Raises:
-        MissingDependencyError: PyBullet is not installed.
         InvalidInputError: the scene types differ, a batch has fewer than 20 scenes, ``seeds`` is below 1, or a side of
             the renders is below 16 pixels.
     """

@@ -24,6 +24,7 @@ from agents.post_training.report import (
     draw_side_by_side,
     measure_prior,
     number_rows,
+    ready_section,
     write_report,
 )
 from agents.post_training.run_files import METRICS_NAME, write_metrics
@@ -81,6 +82,8 @@ def run_demo(
         "seconds": round(time.perf_counter() - started, 1),
         "num_steps": num_steps,
     }
+    if left_out := _left_out(measured):
+        metrics["left_out"] = left_out
     write_report(directory / "report.html", _page(directory, base, results, measured))
     write_metrics(directory, metrics)
     return metrics
@@ -149,20 +152,17 @@ def _page(
             Tile(f"{name}: held-out loss", f"{ratio:.2f}×", "of the base prior"),
         ]
     raw = draw_side_by_side(measured, directory / "samples.png")
-    ready = draw_side_by_side(measured, directory / "ready.png", ready=True)
+    columns, ready, left_out = "Columns: " + ", ".join(measured), [], _left_out(measured)
+    if "feasible" not in left_out:
+        ready = [Picture(draw_side_by_side(measured, directory / "ready.png", ready=True), columns)]
     count = int(before["scenes"])
     sections = [
         Section(
             "As sampled",
             "The first samples of each prior, untouched. The scenes of a row start from the same noise.",
-            [Picture(raw, "Columns: " + ", ".join(measured))],
+            [Picture(raw, columns)],
         ),
-        Section(
-            "Simulation-ready",
-            "The same samples, projected out of penetration and settled. Red objects are not ready: they still move, "
-            "penetrate, or have left the workspace.",
-            [Picture(ready, "Columns: " + ", ".join(measured))],
-        ),
+        ready_section(ready, left_out),
         Section(
             "Numbers", f"Means over {count} samples.", table=number_rows({n: m.figures for n, m in measured.items()})
         ),
@@ -179,6 +179,10 @@ def _page(
     )
     settings = {f"{name}: {key}": value for name, run in results.items() for key, value in run.config.items()}
     return Page(title, lead, tiles, sections, settings)
+
+
+def _left_out(measured: Mapping[str, Measured]) -> dict[str, str]:
+    return {name: reason for part in measured.values() for name, reason in part.left_out.items()}
 
 
 def _share(figures: Mapping[str, float]) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
+from agents.evaluation.physics_figures import leaving_out
 from agents.post_training.guard import realism
 from agents.post_training.rollouts import PromptDeck, run_prompts, stream_seed
 from agents.post_training.run_files import (
@@ -36,7 +37,7 @@ from scene_envs.files import page_part, page_template
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
-    from scene_envs.physics import PhysicsPool
+    from scene_envs.physics import PhysicsPool, ReadyResult
 
 
 SAMPLE_SEED = 100_000
@@ -159,12 +160,14 @@ def _write_comparison(
     names = [name for name in ("reward", "objects", "feasible_objects", "ready_objects") if name in before.figures]
     change = {name: _relative(before.figures[name], after.figures.get(name)) for name in names}
     metrics = {"before": before.figures, "after": after.figures, "change": change, **result.metrics, **extra}
-    pictures = {
-        "before": draw_gallery(before.raw, directory / "before.png"),
-        "after": draw_gallery(after.raw, directory / "after.png"),
-        "before_ready": draw_gallery(before.ready, directory / "before_ready.png", before.is_ready),
-        "after_ready": draw_gallery(after.ready, directory / "after_ready.png", after.is_ready),
-    }
+    left_out = {**before.left_out, **after.left_out}
+    if left_out:
+        metrics["left_out"] = left_out
+    pictures = {}
+    for name, part in {"before": before, "after": after}.items():
+        pictures[name] = draw_gallery(part.raw, directory / f"{name}.png")
+        if part.ready is not None:
+            pictures[f"{name}_ready"] = draw_gallery(part.ready, directory / f"{name}_ready.png", part.is_ready)
     for name in ("guard_within", "guard_beyond"):
         if (path := directory / f"{name}.safetensors").exists():
             pictures[name] = draw_gallery(SceneBatch.load(path), directory / f"{name}.png")
@@ -184,8 +187,9 @@ class Measured:
 
     figures: dict[str, float]
     raw: SceneBatch  # raw samples
-    ready: SceneBatch  # the samples after projection and settling
-    is_ready: Tensor  # (B, N) bool, simulation-ready objects of ``ready``
+    ready: SceneBatch | None  # the samples after projection and settling; None without a simulator
+    is_ready: Tensor | None  # (B, N) bool, simulation-ready objects of ``ready``
+    left_out: Mapping[str, str] = field(default_factory=dict)  # figures that this machine cannot compute, and why
 
 
 def measure_prior(
@@ -211,25 +215,37 @@ def measure_prior(
         count, prompt=prompts, guidance=guidance, claim_guidance=claim_guidance, physics_guidance=0.0,
         num_steps=num_steps, slots=slots, seed=seed,
     )  # fmt: skip
-    feasible = feasibility(raw, pool=pool)
-    ready = make_ready(raw, pool=pool)
-    context = RewardContext(None if prompts is None else tuple(prompts), pool)
-    scored = None if reward is None else evaluate_reward(reward, raw, context)
+    left_out: dict[str, str] = {}
+    ready: ReadyResult | None = None
+    scored: RewardOutput | None = None
     counts = raw.counts.double()
     free = raw.is_free.sum(dim=-1).double()
+    judged: dict[str, float] = {}
+    with leaving_out("feasible", left_out):
+        feasible = feasibility(raw, pool=pool)
+        ready = make_ready(raw, pool=pool)
+        judged = {
+            **_counted("feasible", feasible.counts, feasible.valid, free),
+            **_counted("ready", ready.counts, ready.valid, free),
+            "invalid_scenes": float((~(feasible.valid & ready.valid)).sum()),
+        }
+    context = RewardContext(None if prompts is None else tuple(prompts), pool)
+    if reward is not None:
+        with leaving_out("reward", left_out):
+            scored = evaluate_reward(reward, raw, context)
     figures = {
         "scenes": float(count),
         "objects": float(counts.mean()),
         "objects_sem": _standard_error(counts),
         **({} if scored is None else _mean("reward", scored)),
         **({} if scored is None else {"reward_invalid": float((~scored.is_valid).sum())}),
-        **_counted("feasible", feasible.counts, feasible.valid, free),
-        **_counted("ready", ready.counts, ready.valid, free),
-        "invalid_scenes": float((~(feasible.valid & ready.valid)).sum()),
+        **judged,
         **realism(raw),
         **({} if prompts is None else _mean("prompt_match", PromptMatch()(raw, RewardContext(prompts=tuple(prompts))))),
     }
-    return Measured(figures, raw, ready.batch, ready.ready)
+    if ready is None:
+        return Measured(figures, raw, None, None, left_out)
+    return Measured(figures, raw, ready.batch, ready.ready, left_out)
 
 
 def _counted(name: str, counts: Tensor, valid: Tensor, free: Tensor) -> dict[str, float]:
@@ -267,10 +283,8 @@ def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bo
     """Draw the first scenes of up to three priors, by caption and from the same noise, as a PNG: a row per scene, a
     column per prior. ``ready`` shows them after projection and settling, with objects that are not ready in red.
     """
-    drawn = [
-        _drawn(part.ready if ready else part.raw, part.is_ready if ready else None, _GALLERY // 2)
-        for part in measured.values()
-    ]
+    shown = [(part.ready, part.is_ready) if ready else (part.raw, None) for part in measured.values()]
+    drawn = [_drawn(batch, is_ready, _GALLERY // 2) for batch, is_ready in shown if batch is not None]
     images = [image for row in zip(*(images for images, _ in drawn), strict=True) for image in row]
     texts = zip(*(captions for _, captions in drawn), strict=True)
     captions = [f"{name}: {text}" for row in texts for name, text in zip(measured, row, strict=True)]
@@ -362,11 +376,14 @@ def _page(
         f"{metrics['iterations']} iterations of {algorithm} on {reward}, with the pretraining loss on real scenes as "
         f"regularisation. All numbers are means over {count} fresh, seeded samples of each prior; none was selected."
     )
+    left_out = metrics.get("left_out", {})
+    judged = "left out" if "feasible" in left_out else "physics failed"
+    scored = "left out" if "reward" in left_out else "no scene could be scored"
     tiles = [
-        _tile(f"reward: {reward}", "reward", before, after, "no scene could be scored"),
+        _tile(f"reward: {reward}", "reward", before, after, scored),
         _tile("objects per scene", "objects", before, after),
-        _tile("feasible as sampled", "feasible_objects", before, after),
-        _tile("simulation-ready", "ready_objects", before, after),
+        _tile("feasible as sampled", "feasible_objects", before, after, judged),
+        _tile("simulation-ready", "ready_objects", before, after, judged),
         Tile("held-out loss", f"{guard['ratio']:.2f}×", f"of the base prior; limit {guard['limit']:g}×"),
     ]
     over = guard["over_optimised_from"]
@@ -383,15 +400,22 @@ def _page(
             "The first samples of each prior from the same noise, untouched.",
             [Picture(pictures["before"], "Before"), Picture(pictures["after"], "After")],
         ),
-        Section(
-            "Simulation-ready",
-            "The same samples, projected out of penetration and settled. Red objects are not ready: they still move, "
-            "penetrate, or have left the workspace.",
-            [Picture(pictures["before_ready"], "Before"), Picture(pictures["after_ready"], "After")],
+        ready_section(
+            [Picture(pictures[key], key[:-6].title()) for key in ("before_ready", "after_ready") if key in pictures],
+            left_out,
         ),
         Section("Numbers", table=_with_change(before, after)),
     ]
     return Page(title, lead, tiles, sections, settings)
+
+
+def ready_section(pictures: Sequence[Picture], left_out: Mapping[str, str]) -> Section:
+    """The section on samples after projection and settling, or why it is left out."""
+    text = (
+        "The same samples, projected out of penetration and settled. Red objects are not ready: they still move, "
+        "penetrate, or have left the workspace."
+    )
+    return Section("Simulation-ready", text if pictures else f"Left out: {left_out.get('feasible')}.", pictures)
 
 
 def guard_verdict(guard: Mapping[str, Any]) -> str:
@@ -478,9 +502,7 @@ def _number(figures: Mapping[str, float], name: str) -> str:
     return f"{value:.2f}" if error is None else f"{value:.2f} ± {error:.2f}"
 
 
-def _tile(
-    label: str, name: str, before: Mapping[str, float], after: Mapping[str, float], failure: str = "physics failed"
-) -> Tile:
+def _tile(label: str, name: str, before: Mapping[str, float], after: Mapping[str, float], failure: str = "") -> Tile:
     if name not in before or name not in after:
         return Tile(label, "–", failure)
     change = _relative(before[name], after[name])

@@ -30,7 +30,7 @@ from agents.utils.loggers import RunLogger, make_logger
 from agents.utils.process_group import ProcessGroup, is_first_process
 from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
-from scene_envs.errors import InvalidInputError, MissingDependencyError, TrainingError
+from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed, write_json, write_text
 from scene_envs.progress import Progress
 from scene_envs.scene import POSE_FEATURES
@@ -88,17 +88,14 @@ class TrainingLog:
 
 
 def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> None:
-    """Draw a gallery of samples of a prior, ``samples-STEP.png`` in ``directory``; skipped without PyBullet."""
+    """Draw a gallery of samples of a prior, ``samples-STEP.png`` in ``directory``."""
     from scene_envs.render import gallery, render
 
     batch = prior.sample(8, num_steps=50, seed=seed).to("cpu")
     captions = [f"{int(count)} objects" for count in batch.counts]
-    try:
-        images = render(batch, width=400, height=300)
-    except MissingDependencyError as error:
-        logger.warning("no pictures of samples: %s", error)
-        return
-    gallery(list(images), columns=4, captions=captions).save(directory / f"samples-{step:07d}.png")
+    gallery(list(render(batch, width=400, height=300)), columns=4, captions=captions).save(
+        directory / f"samples-{step:07d}.png"
+    )
 
 
 @torch.no_grad()

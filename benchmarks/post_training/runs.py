@@ -112,7 +112,7 @@ def _measured(path: Path, measures: Sequence[str]) -> bool:
     if not path.exists():
         return False
     evaluation = json.loads(path.read_text(encoding="utf-8")).get("evaluation", {})
-    return set(measures) <= {*evaluation.get("groups", {}), *evaluation.get("skipped", {})}
+    return set(measures) <= {*evaluation.get("groups", {}), *evaluation.get("left_out", {})}
 
 
 def _numbers(metrics: Mapping[str, object]) -> dict[str, float]:

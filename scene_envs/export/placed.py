@@ -8,19 +8,20 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 import trimesh
 from numpy.typing import NDArray
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import Asset, ConvexPart
 from scene_envs.assets.shapes import convex_hull
-from scene_envs.rotations import matrix_to_quaternion, project_to_so3
-from scene_envs.scene import SceneBatch, require_rigid_poses
+from scene_envs.physics.parts import quaternions
 from scene_envs.scene_types import SceneType
+
+if TYPE_CHECKING:
+    from scene_envs.scene import SceneBatch
 
 _MAX_COLORS = 1024
 _CELL = 4
@@ -94,10 +95,13 @@ def place(batch: SceneBatch) -> list[PlacedScene]:
     Raises:
         InvalidInputError: a pose is not finite, or a matrix is not a rotation; the message names its scene and slot.
 
+    >>> from scene_envs.scene import SceneBatch
     >>> scene = place(SceneBatch.empty("dimsum_table", 1))[0]
     >>> [(item.name, item.welded) for item in scene.objects]
     [('cafe_table_0', True)]
     """
+    from scene_envs.scene import require_rigid_poses
+
     batch = batch.to("cpu")
     require_rigid_poses(batch)
     scene_type, library = batch.scene_type, batch.scene_type.library
@@ -154,13 +158,16 @@ def exact_rotations(matrices: NDArray[np.floating]) -> Array:
     """Nearest rotations (..., 3, 3) in double precision, orthonormal to a few 1e-16. The SVD leaves an error of some
     1e-16 per entry; one Newton step of the polar decomposition halves it.
     """
-    rotation: Array = project_to_so3(torch.from_numpy(np.asarray(matrices, dtype=np.float64))).numpy()
+    left, _, right = np.linalg.svd(np.asarray(matrices, dtype=np.float64))
+    left[..., -1] *= np.sign(np.linalg.det(left @ right))[..., None]
+    rotation: Array = left @ right
     return rotation @ (1.5 * np.eye(3) - 0.5 * rotation.swapaxes(-1, -2) @ rotation)  # type: ignore[no-any-return]
 
 
 def quaternion(rotation: Array) -> Array:
     """(4,) unit quaternion (w, x, y, z) of a rotation (3, 3), in double precision."""
-    return matrix_to_quaternion(torch.from_numpy(np.asarray(rotation, dtype=np.float64))).numpy()  # type: ignore[no-any-return]
+    x, y, z, w = quaternions(np.asarray(rotation, dtype=np.float64)[None])[0]
+    return np.copysign(1.0, w) * np.array([w, x, y, z])
 
 
 def angle_axis(rotation: Array) -> tuple[float, Array]:

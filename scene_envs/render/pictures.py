@@ -22,7 +22,6 @@ from scene_envs.render.stage import (
     soft_shadow,
     surface_normals,
 )
-from scene_envs.rotations import matrix_to_quaternion
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, SceneType
 
@@ -53,7 +52,7 @@ def render(
     height: int | None = None,
     highlight: torch.Tensor | NDArray[np.bool_] | None = None,
 ) -> NDArray[np.uint8]:
-    """Draw scenes in software; no display and no GPU are needed.
+    """Draw scenes in software; no display, GPU or simulator is needed.
 
     Args:
         batch: B scenes.
@@ -71,7 +70,6 @@ def render(
     Raises:
         UnknownNameError: no such style.
         InvalidInputError: sizes below 1 pixel, or a highlight of another shape.
-        MissingDependencyError: PyBullet is not installed.
     """
     scene_type = batch.scene_type
     if style not in _STYLES:
@@ -84,12 +82,11 @@ def render(
     marked = _as_mask(highlight, batch)
     translations = batch.translations.detach().cpu().double().numpy()
     categories = batch.categories.detach().cpu().numpy()
-    rotations = torch.where(batch.is_empty[..., None, None], torch.eye(3).to(batch.rotations), batch.rotations)
-    quaternions = matrix_to_quaternion(rotations.detach().cpu().double()).numpy()
+    rotations = batch.rotations.detach().cpu().double().numpy()
     stage = get_stage(scene_type.assets, scene_type.asset_folders)
     images = np.empty((len(batch), height, width, 3), dtype=np.uint8)
-    for index, rotation in enumerate(rotations.detach().cpu().double().numpy()):
-        stage.place(translations[index], quaternions[index], categories[index])
+    for index, rotation in enumerate(rotations):
+        stage.place(translations[index], rotation, categories[index])
         if style == "semantic":
             images[index] = _semantic(stage.look(default, width, height), categories[index], scene_type)
         else:
@@ -124,13 +121,13 @@ def _picture(
 
     scale = _SUPERSAMPLING
     framing = frame_scene_type(scene_type)
-    frame = stage.look(camera, scale * width, scale * height, framing.to_light.tolist())
+    frame = stage.look(camera, scale * width, scale * height)
     lamp = light_camera(scene_type)
     # Size (m) of a pixel of the lamp's image
     texel = 2.0 * np.linalg.norm(np.subtract(lamp.position, lamp.target)) / lamp.height
     texel *= np.tan(np.radians(lamp.fov_y) / 2.0)
     light = stage.look(lamp, lamp.width, lamp.height)
-    color = frame.color
+    color = stage.paint(frame, framing.to_light)
     if marked.any():
         red = (frame.slots >= 0) & marked[np.maximum(frame.slots, 0)]
         color = np.where(
@@ -140,7 +137,9 @@ def _picture(
     shadow = soft_shadow(frame, light, normals, bias=1.3 * texel, lift=2.6 * texel)[..., None]
     reach = 0.04 * np.sqrt(framing.radius / _TABLE)
     shade = uniform_filter(contact_shade(frame, normals, radius=reach), 2 * scale + 1)[..., None]
-    towards = np.clip(2.0 * normals @ (frame.view[:3, :3] @ framing.to_light).astype(np.float32), 0.0, 1.0)[..., None]
+    towards = np.clip(2.0 * normals @ (frame.camera.view[:3, :3] @ framing.to_light).astype(np.float32), 0.0, 1.0)[
+        ..., None
+    ]
     lit = color * (1.0 - _SHADOW * shadow * (0.4 + 0.6 * towards)) * (1.0 - np.minimum(1.25 * shade, 0.5))
     ramp = np.linspace(0.0, 1.0, scale * height, dtype=np.float32)[:, None, None]
     backdrop = _BACKDROP[0] * (1.0 - ramp) + _BACKDROP[1] * ramp

@@ -1,15 +1,10 @@
-"""Stage, cameras and lighting: what PyBullet draws of a library's bodies, from where, and with which shadows."""
+"""Stage, cameras and lighting: what is seen of a library's meshes, from where, and with which shadows."""
 
 from __future__ import annotations
 
-import atexit
-import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,12 +13,11 @@ from numpy.typing import NDArray
 from scene_envs.arrays import Array, Index
 from scene_envs.assets import Asset, get_library
 from scene_envs.errors import InvalidInputError
-from scene_envs.progress import quiet_pybullet
+from scene_envs.render.raster import Pinhole, corner_weights, visible_triangles
 from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type
 
-_AWAY = (0.0, 0.0, -1000.0)
-_CELL, _CELLS = 8, 32
-"""The palette texture: 32 x 32 cells of 8 pixels, one per colour."""
+_AMBIENT, _DIFFUSE = 0.70, 0.40
+"""Light from everywhere, and light of the lamp on a surface that faces it."""
 _SIDES = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _TOP = np.array([0.0, 0.0, 1.0])
 _RAYS = 24
@@ -44,154 +38,96 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Frame:
-    """Images of one camera."""
+    """What a camera sees in each pixel."""
 
-    color: NDArray[np.float32]  # (H, W, 3) float32 in 0..255, lit but without shadows
     depth: NDArray[np.float32]  # (H, W) float32, distance along the viewing direction, m; inf without an object
     slots: NDArray[np.int64]  # (H, W) int64, slot of the visible object; -1 without one
-    view: NDArray[np.float64]  # (4, 4) transform from world to camera (x right, y up, z backward)
-    focal: NDArray[np.float64]  # (2,) focal lengths, in half image widths and heights
-
-
-def load_pybullet() -> ModuleType:
-    """The PyBullet module; raises MissingDependencyError where it is not installed."""
-    return quiet_pybullet(
-        "pictures need PyBullet, which is not installed; install it with `pip install pybullet` "
-        "(its wheels exist for Python 3.10 and 3.11)"
-    )
+    faces: NDArray[np.int64]  # (H, W) int64, visible triangle among those of the stage; -1 without one
+    camera: Pinhole
 
 
 class Stage:
-    """Bodies of the assets ``names``, in category order, made on first use; pictures only change their poses."""
+    """The visual meshes of the assets ``names``, in category order; pictures place copies of them."""
 
     def __init__(self, names: tuple[str, ...], folders: tuple[str, ...] = ()) -> None:
-        self._bullet = load_pybullet()
-        self._client: int = self._bullet.connect(self._bullet.DIRECT)
         self._library = get_library(names, folders)
-        self._palette, self._texture = self._load_palette()
-        self._shapes: dict[int, int] = {}
-        self._bodies: list[list[int]] = [[] for _ in names]
-        atexit.register(self.close)
+        self._models: dict[int, _Model] = {}
+        self.place(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
 
-    def close(self) -> None:
-        """Disconnect from PyBullet."""
-        if self._client >= 0 and self._bullet.isConnected(self._client):
-            self._bullet.disconnect(self._client)
-        self._client = -1
+    def place(self, translations: Array, rotations: Array, categories: Index) -> None:
+        """Put up the objects of one scene, and nothing else.
 
-    def place(
-        self, translations: NDArray[np.float64], quaternions: NDArray[np.float64], categories: NDArray[np.int64]
-    ) -> None:
-        """Move bodies to the objects of one scene, and all others out of sight.
-
-        Poses are translations (N, 3) m and quaternions (N, 4) (w, x, y, z). Slots whose category (N,) is outside the
-        library are empty.
+        Poses are translations (N, 3) m and rotations (N, 3, 3). Slots whose category (N,) is outside the library are
+        empty.
         """
-        bullet, used = self._bullet, [0] * len(self._bodies)
-        highest = max((body for bodies in self._bodies for body in bodies), default=-1)
-        slot_of = np.full(highest + 1 + len(categories), -1, dtype=np.int64)
-        for slot, category in enumerate(categories.tolist()):
-            if not 0 <= category < len(self._bodies):
-                continue
-            bodies = self._bodies[category]
-            if used[category] == len(bodies):
-                bodies.append(self._add_body(category))
-            body = bodies[used[category]]
-            used[category] += 1
-            w, x, y, z = quaternions[slot].tolist()
-            bullet.resetBasePositionAndOrientation(
-                body, translations[slot].tolist(), (x, y, z, w), physicsClientId=self._client
+        # In an order that does not depend on slots, which decides between surfaces at the same place
+        order = np.lexsort((*translations.T, categories))
+        slots = [slot for slot in order.tolist() if 0 <= categories[slot] < len(self._library)]
+        models = [self._model(int(categories[slot])) for slot in slots]
+        starts = np.cumsum([0, *(len(model.vertices) for model in models)])
+        placed = [(model, rotations[slot].T, translations[slot]) for slot, model in zip(slots, models, strict=True)]
+        none = np.empty((0, 3))
+        self._vertices = np.concatenate([none, *(model.vertices @ turn + shift for model, turn, shift in placed)])
+        self._normals = np.concatenate([none, *(model.normals @ turn for model, turn, _ in placed)])
+        self._colors = np.concatenate([none, *(model.colors for model in models)])
+        faces = (model.faces + start for model, start in zip(models, starts, strict=False))
+        self._faces = np.concatenate([none.astype(np.int64), *faces])
+        self._slot_of = np.repeat(np.array(slots, dtype=np.int64), [len(model.faces) for model in models])
+
+    def look(self, camera: Camera, width: int, height: int) -> Frame:
+        """What ``camera`` sees of the placed objects, in an image of ``width`` x ``height`` pixels."""
+        pinhole = Pinhole.at(camera.position, camera.target, camera.up, camera.fov_y, width, height)
+        faces, depth = visible_triangles(self._triangles(pinhole), pinhole)
+        slots = np.full(faces.shape, -1, dtype=np.int64)
+        slots[faces >= 0] = self._slot_of[faces[faces >= 0]]
+        return Frame(depth, slots, faces, pinhole)
+
+    def paint(self, frame: Frame, to_light: Array) -> Image:
+        """(H, W, 3) float32 in 0..255: colours of what ``frame`` sees, lit from the direction ``to_light`` (3,) without
+        shadows; 0 without an object.
+        """
+        rows, columns = np.nonzero(frame.faces >= 0)
+        faces, triangles = frame.faces[rows, columns], self._triangles(frame.camera)
+        weights = corner_weights(triangles, faces, rows, columns, frame.camera).astype(np.float32)
+        # Light falls on the side of a surface that the camera sees, whichever way its normals point.
+        away = np.einsum("tk,tk->t", triangles[:, 0], np.cross(*np.diff(triangles, axis=1).swapaxes(0, 1))) > 0.0
+        facing = self._normals @ (to_light / np.linalg.norm(to_light))
+        towards = np.maximum(np.where(away[:, None], -1.0, 1.0) * facing[self._faces], 0.0)
+        lit = (self._colors[self._faces] * (_AMBIENT + _DIFFUSE * towards[..., None])).astype(np.float32)
+        lit[:, 1:] -= lit[:, :1]
+        corners = lit.reshape(-1, 9)[faces]
+        color = np.zeros((*frame.faces.shape, 3), dtype=np.float32)
+        color[rows, columns] = np.minimum(
+            corners[:, :3] + weights[:, :1] * corners[:, 3:6] + weights[:, 1:] * corners[:, 6:], 255.0
+        )
+        return color
+
+    def _triangles(self, camera: Pinhole) -> Array:
+        return (self._vertices @ camera.view[:3, :3].T + camera.view[:3, 3])[self._faces]
+
+    def _model(self, category: int) -> _Model:
+        if category not in self._models:
+            asset = self._library[category]
+            mesh = asset.visual
+            self._models[category] = _Model(
+                np.asarray(mesh.vertices, dtype=np.float64),
+                np.asarray(mesh.vertex_normals, dtype=np.float64),
+                vertex_colors(asset).astype(np.float64),
+                np.asarray(mesh.faces, dtype=np.int64),
             )
-            slot_of[body] = slot
-        for bodies, count in zip(self._bodies, used, strict=True):
-            for body in bodies[count:]:
-                bullet.resetBasePositionAndOrientation(body, _AWAY, (0, 0, 0, 1), physicsClientId=self._client)
-        self._slot_of = slot_of
+        return self._models[category]
 
-    def look(self, camera: Camera, width: int, height: int, light: Sequence[float] = (0.3, -0.4, 1.0)) -> Frame:
-        """Draw the placed objects, ``width`` x ``height`` pixels, lit from direction ``light``."""
-        bullet = self._bullet
-        distance = float(np.linalg.norm(np.subtract(camera.position, camera.target)))
-        near, far = 0.1 * distance, 10.0 * distance
-        view = bullet.computeViewMatrix(camera.position, camera.target, camera.up)
-        projection = bullet.computeProjectionMatrixFOV(camera.fov_y, width / height, near, far)
-        _, _, rgba, depth, bodies = bullet.getCameraImage(
-            width, height, view, projection, renderer=bullet.ER_TINY_RENDERER, shadow=0, lightDirection=light,
-            lightColor=(1, 1, 1), lightAmbientCoeff=0.70, lightDiffuseCoeff=0.36, lightSpecularCoeff=0.05,
-            physicsClientId=self._client,
-        )  # fmt: skip
-        color = np.reshape(np.asarray(rgba), (height, width, 4))[..., :3].astype(np.float32)
-        raw = np.reshape(np.asarray(depth, dtype=np.float64), (height, width))
-        body = np.reshape(np.asarray(bodies, dtype=np.int64), (height, width))
-        slots = np.where(body >= 0, self._slot_of[np.maximum(body, 0)], -1)
-        metres = np.where(slots >= 0, far * near / (far - (far - near) * raw), np.inf)
-        matrix = np.asarray(projection).reshape(4, 4)
-        return Frame(
-            color,
-            metres.astype(np.float32),
-            slots,
-            np.asarray(view, dtype=np.float64).reshape(4, 4).T,
-            np.array([matrix[0, 0], matrix[1, 1]]),
-        )
 
-    def _load_palette(self) -> tuple[NDArray[np.int64], int]:
-        """All colours of the library in one texture, because TinyRenderer draws no vertex colours."""
-        from PIL import Image
-
-        palette, self._mask = make_palette(np.concatenate([_color_codes(asset) for asset in self._library]), _CELLS**2)
-        codes = np.zeros(_CELLS**2, dtype=np.int64)
-        codes[: len(palette)] = palette
-        rgb = np.stack([codes >> 16, (codes >> 8) & 255, codes & 255], axis=-1).astype(np.uint8)
-        pixels = rgb.reshape(_CELLS, _CELLS, 3).repeat(_CELL, axis=0).repeat(_CELL, axis=1)
-        handle, path = tempfile.mkstemp(suffix=".png")
-        os.close(handle)
-        try:
-            Image.fromarray(pixels).save(path)
-            texture: int = self._bullet.loadTexture(path, physicsClientId=self._client)
-        finally:
-            Path(path).unlink()
-        return palette, texture
-
-    def _add_body(self, category: int) -> int:
-        if category not in self._shapes:
-            self._shapes[category] = self._add_shape(self._library[category])
-        body: int = self._bullet.createMultiBody(
-            baseMass=0.0, baseVisualShapeIndex=self._shapes[category], physicsClientId=self._client
-        )
-        self._bullet.changeVisualShape(body, -1, textureUniqueId=self._texture, physicsClientId=self._client)
-        return body
-
-    def _add_shape(self, asset: Asset) -> int:
-        cells = np.searchsorted(self._palette, _color_codes(asset) & self._mask)
-        uv = np.stack([(cells % _CELLS + 0.5) / _CELLS, 1.0 - (cells // _CELLS + 0.5) / _CELLS], axis=1)
-        gloss = 0.0 if asset.static else 0.35
-        return self._bullet.createVisualShape(
-            self._bullet.GEOM_MESH,
-            vertices=asset.visual.vertices.tolist(),
-            indices=asset.visual.faces.ravel().tolist(),
-            normals=asset.visual.vertex_normals.tolist(),
-            uvs=uv.tolist(),
-            rgbaColor=(1, 1, 1, 1),
-            specularColor=(gloss, gloss, gloss),
-            physicsClientId=self._client,
-        )
+@dataclass(frozen=True)
+class _Model:
+    vertices: Array  # (V, 3), m
+    normals: Array  # (V, 3), unit vectors
+    colors: Array  # (V, 3), 0..255
+    faces: Index  # (F, 3)
 
 
 get_stage = cache(Stage)
 """The stage of this process for asset names in category order, which are looked up in the given folders first."""
-
-
-def make_palette(codes: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], int]:
-    """At most ``limit`` colours (0xRRGGBB, sorted) that replace ``codes``, and the mask of the bits they keep. Colours
-    are exact as long as they fit; of more (in scans), the lowest bits of each channel are dropped.
-    """
-    for bits in range(8, 0, -1):
-        channel = (0xFF << (8 - bits)) & 0xFF
-        mask = channel << 16 | channel << 8 | channel
-        palette = np.unique(codes & mask)
-        if len(palette) <= limit:
-            break
-    return palette, mask
 
 
 def vertex_colors(asset: Asset) -> NDArray[np.uint8]:
@@ -202,11 +138,6 @@ def vertex_colors(asset: Asset) -> NDArray[np.uint8]:
     if getattr(visual, "kind", None) is None:
         return np.tile(np.array(asset.color, dtype=np.uint8), (len(asset.visual.vertices), 1))
     return np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
-
-
-def _color_codes(asset: Asset) -> NDArray[np.int64]:
-    rgb = vertex_colors(asset).astype(np.int64)
-    return (rgb[:, 0] << 16) | (rgb[:, 1] << 8) | rgb[:, 2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,8 +326,8 @@ def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
 def camera_points(frame: Frame) -> Image:
     """(H, W, 3): the visible point of each pixel in the camera frame (x right, y up, z backward), m."""
     height, width = frame.depth.shape
-    x = ((np.arange(width, dtype=np.float32) + 0.5) * (2.0 / width) - 1.0) / frame.focal[0]
-    y = (1.0 - (np.arange(height, dtype=np.float32) + 0.5) * (2.0 / height)) / frame.focal[1]
+    x = ((np.arange(width, dtype=np.float32) + 0.5) * (2.0 / width) - 1.0) / frame.camera.focal[0]
+    y = (1.0 - (np.arange(height, dtype=np.float32) + 0.5) * (2.0 / height)) / frame.camera.focal[1]
     depth = np.where(np.isfinite(frame.depth), frame.depth, 0.0).astype(np.float32)
     return np.stack([x[None, :] * depth, y[:, None] * depth, -depth], axis=-1).astype(np.float32)
 
@@ -419,12 +350,12 @@ def soft_shadow(frame: Frame, light: Frame, normals: Image, *, bias: float = 0.0
     off their surface by ``lift`` (m), so that no surface shadows itself.
     """
     seen = np.isfinite(frame.depth)
-    to_light = (light.view @ np.linalg.inv(frame.view)).astype(np.float32)
+    to_light = (light.camera.view @ np.linalg.inv(frame.camera.view)).astype(np.float32)
     points = (camera_points(frame)[seen] + np.float32(lift) * normals[seen]) @ to_light[:3, :3].T + to_light[:3, 3]
     distance = np.maximum(-points[:, 2], np.float32(1e-3))  # objects may lie behind the lamp
     height, width = light.depth.shape
-    column = (points[:, 0] / distance * np.float32(light.focal[0]) + 1.0) * (0.5 * width)
-    row = (1.0 - points[:, 1] / distance * np.float32(light.focal[1])) * (0.5 * height)
+    column = (points[:, 0] / distance * np.float32(light.camera.focal[0]) + 1.0) * (0.5 * width)
+    row = (1.0 - points[:, 1] / distance * np.float32(light.camera.focal[1])) * (0.5 * height)
     nearest = light.depth.ravel()
     hidden = np.zeros(len(points), dtype=np.float32)
     for dx, dy in _SPIRAL * _SOFTNESS:
@@ -444,8 +375,8 @@ def contact_shade(frame: Frame, normals: Image, *, radius: float = 0.04) -> Imag
     rows, columns = np.nonzero(grid[..., 2] < 0)
     surroundings = grid.reshape(-1, 3)
     points, facing = grid[rows, columns], normals[::_STRIDE, ::_STRIDE][rows, columns]
-    reach_x = (0.5 * width * frame.focal[0] * radius / -points[:, 2]).astype(np.float32)
-    reach_y = (0.5 * height * frame.focal[1] * radius / -points[:, 2]).astype(np.float32)
+    reach_x = (0.5 * width * frame.camera.focal[0] * radius / -points[:, 2]).astype(np.float32)
+    reach_y = (0.5 * height * frame.camera.focal[1] * radius / -points[:, 2]).astype(np.float32)
     closed = np.zeros(len(points), dtype=np.float32)
     for dx, dy in _SPIRAL:
         index = _pixel(rows + 0.5 + dy * reach_y, height) * width + _pixel(columns + 0.5 + dx * reach_x, width)

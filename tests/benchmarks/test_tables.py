@@ -387,12 +387,12 @@ def test_an_interrupted_evaluation_goes_on_and_a_finished_one_is_read(
         calls.append(words)
         groups = {"layout": {"free_objects_mean": 17.0}}
         path.write_text(
-            json.dumps({"free_objects_mean": 17.0, "evaluation": {"groups": groups, "skipped": {"physics": ""}}})
+            json.dumps({"free_objects_mean": 17.0, "evaluation": {"groups": groups, "left_out": {"physics": ""}}})
         )
         return 0
 
     monkeypatch.setattr("benchmarks.post_training.runs.scene_envs", evaluate)
-    path.write_text(json.dumps({"num_steps": 50.0, "evaluation": {"groups": {}, "skipped": {}}}))
+    path.write_text(json.dumps({"num_steps": 50.0, "evaluation": {"groups": {}, "left_out": {}}}))
     for _ in range(2):
         assert measure("dimsum_table", tmp_path, ("layout", "physics"), 8) == {"free_objects_mean": 17.0}
     assert len(calls) == 1

@@ -18,6 +18,7 @@ from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
 from tests.helpers.authors_flux import random_state, write_checkpoint
+from tests.helpers.simulators import no_simulator
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +52,16 @@ def test_sample_then_project(prior, tmp_path, capsys):
     assert {"before.png", "ready.png"} <= files(ready)
     assert metrics(ready)["ready"]["valid"] == 3
     assert "simulation-ready" in capsys.readouterr().out
+
+
+def test_a_sample_without_a_simulator_has_no_reward_and_says_why(prior, tmp_path, monkeypatch, capsys):
+    no_simulator(monkeypatch)
+    words = ["sample", f"prior={prior}", "count=2", "num_steps=2", "workers=0", "pictures=1", f"output={tmp_path}"]
+    assert main(words) == 0
+    assert metrics(tmp_path)["left_out"] == {"reward": "no simulator here"}
+    assert "reward" not in metrics(tmp_path)
+    assert "reward left out: no simulator here" in (tmp_path / "log.txt").read_text()
+    assert {"scenes.safetensors", "gallery.png"} <= files(tmp_path)
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
+from tests.helpers.simulators import no_simulator
 
 pytest.importorskip("pybullet")
 
@@ -196,3 +197,24 @@ def test_a_dataset_with_a_scene_that_is_not_finite_is_refused(
     assert "Traceback" not in message
     assert "row 3" in message
     assert "slot 2" in message
+
+
+def test_without_a_simulator_the_rest_is_measured_and_physics_later(
+    prior: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    words = ["evaluate", f"prior={prior}", *QUICK, "measures=[layout,physics,ready]", f"output={tmp_path}"]
+    with monkeypatch.context() as without:
+        no_simulator(without)
+        assert main(words) == 0
+    found = metrics(tmp_path)
+    assert "collision_rate" in found
+    assert not {"feasible_fraction", "stable_fraction", "ready_fraction"} & set(found)
+    left_out = found["evaluation"]["left_out"]
+    assert left_out == {"physics": "feasible figures: no simulator here", "ready": "no simulator here"}
+    assert "- physics not measured: feasible figures: no simulator here" in capsys.readouterr().out
+    assert "feasible left out: no simulator here" in log(tmp_path)
+    assert main(words) == 0
+    found = metrics(tmp_path)
+    assert {"collision_rate", "feasible_fraction", "ready_fraction"} <= set(found)
+    assert found["evaluation"]["left_out"] == {}
+    assert log(tmp_path).count("layout measured in") == 1

@@ -28,7 +28,6 @@ from benchmarks.set_encoder_training import SetEncoderTraining, damage, train_se
 from scene_envs.datasets import to_union
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 from scene_envs.render import render
-from scene_envs.render.stage import get_stage
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import union_scene_type
 
@@ -241,7 +240,6 @@ SIZE = {"width": 48, "height": 36}
 
 @pytest.fixture(scope="module")
 def scenes() -> SceneBatch:
-    pytest.importorskip("pybullet")
     return grammar_scenes("dimsum_table", 120, seed=6)
 
 
@@ -265,14 +263,6 @@ def test_class_images_are_the_renders(scenes: SceneBatch) -> None:
     assert int(index.max()) == colors - 1
     for value in range(colors):
         assert len(torch.unique(images[index == value], dim=0)) == 1
-
-
-def test_without_pybullet_the_message_says_so(scenes: SceneBatch, monkeypatch: pytest.MonkeyPatch) -> None:
-    get_stage.cache_clear()
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(MissingDependencyError, match="PyBullet"):
-        render_classifier_accuracy(scenes[:20], scenes[20:40], seeds=1)
-    get_stage.cache_clear()
 
 
 def test_bad_input_is_refused(scenes: SceneBatch) -> None:

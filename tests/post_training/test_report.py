@@ -17,7 +17,7 @@ from agents.post_training import learner as learned_rewards
 from agents.post_training import post_train_and_compare
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
-from agents.post_training.report import Page, Picture, Section, Tile, load_learned_rewards, write_report
+from agents.post_training.report import Page, Picture, Section, Tile, load_learned_rewards, measure_prior, write_report
 from agents.post_training.run_files import draw_curve
 from agents.post_training.trainer import post_train
 from agents.priors.prior import ScenePrior
@@ -26,6 +26,7 @@ from rewards import make_reward
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
+from tests.helpers.simulators import no_simulator
 from tests.helpers.small_runs import count_objects, small_config
 
 
@@ -99,6 +100,23 @@ def test_report_and_metrics_have_the_trained_reward_before_and_after(tmp_path: P
     assert "reward: squared count" in page
     assert "the trained reward" in page
     assert f"{metrics['after']['reward']:.2f}" in page
+
+
+@pytest.mark.slow
+def test_a_report_without_a_simulator_says_what_it_leaves_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    no_simulator(monkeypatch)
+    config = small_config(tmp_path, iterations=1)
+    post_train_and_compare(config, scenes=3, num_steps=4, prior=tiny_prior(slots=6))
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["left_out"] == {"feasible": "no simulator here"}
+    for when in ("before", "after"):
+        assert {"reward", "objects"} <= set(metrics[when])
+        assert not {"feasible_objects", "ready_objects", "invalid_scenes"} & set(metrics[when])
+    page = (tmp_path / "report.html").read_text()
+    assert "Left out: no simulator here." in page
+    assert not (tmp_path / "after_ready.png").exists()
+    parts = {"base": measure_prior(tiny_prior(slots=6), 2, num_steps=2)}
+    assert (parts["base"].ready, parts["base"].is_ready) == (None, None)
 
 
 @pytest.mark.slow

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 import torch
 
-from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
+from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.render import gallery, picture_camera, render
-from scene_envs.render.stage import get_stage, load_pybullet, make_palette, vertex_colors
 from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, get_scene_type
@@ -36,11 +33,6 @@ def color(name):
 def where(image, name):
     """(row, column) of the pixels that show ``name`` in a semantic image."""
     return np.argwhere((image == color(name)).all(axis=-1))
-
-
-@pytest.fixture(autouse=True)
-def _needs_pybullet():
-    pytest.importorskip("pybullet")
 
 
 @pytest.mark.slow
@@ -112,16 +104,6 @@ def test_highlighted_objects_turn_red_and_others_keep_their_color():
     assert red > blue + 40
 
 
-def test_bodies_are_kept_between_pictures():
-    stage = get_stage(DIMSUM.assets)
-    batch = scene(("teapot", 0.2, 0.1, 0, 0), ("teacup", 0.0, -0.3, 0, 0))
-    render(batch, width=16, height=12)
-    before = sum(map(len, stage._bodies))
-    for _ in range(3):
-        render(batch, width=16, height=12)
-    assert sum(map(len, stage._bodies)) == before
-
-
 def test_an_own_camera_is_used():
     away = Camera(position=(0, 0, 1.7), target=(0, 0, 5.0), up=(1, 0, 0), width=20, height=10)
     image = render(scene(), style="semantic", camera=away)
@@ -140,31 +122,6 @@ def test_wrong_arguments_are_named():
         render(scene(), width=0)
     with pytest.raises(InvalidInputError, match=r"\(1, 8\); got \(1, 3\)"):
         render(scene(), highlight=torch.zeros(1, 3, dtype=torch.bool))
-
-
-def test_palettes_are_exact_as_long_as_they_fit_and_close_where_they_do_not():
-    few = np.array([0x123456, 0xFFFFFF, 0x123456, 0x000000])
-    palette, mask = make_palette(few, 3)
-    assert (palette.tolist(), mask) == ([0x000000, 0x123456, 0xFFFFFF], 0xFFFFFF)
-    many = np.random.default_rng(0).integers(0, 1 << 24, 20_000)
-    palette, mask = make_palette(many, 1024)
-    assert len(palette) <= 1024
-    stand_in = palette[np.searchsorted(palette, many & mask)]
-    for shift in (0, 8, 16):
-        assert np.abs((many >> shift & 255) - (stand_in >> shift & 255)).max() < 32
-
-
-def test_the_largest_library_keeps_its_colors():
-    room = get_scene_type("restaurant_high_clutter")
-    colors = np.unique(np.concatenate([vertex_colors(asset) for asset in room.library]), axis=0)
-    assert len(colors) < 1024
-    assert make_palette(colors.astype(np.int64) @ [1 << 16, 1 << 8, 1], 1024)[1] == 0xFFFFFF
-
-
-def test_missing_pybullet_is_said_clearly(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(MissingDependencyError, match="pip install pybullet"):
-        load_pybullet()
 
 
 def test_gallery_tiles_row_by_row_and_keeps_pixels():

@@ -10,6 +10,7 @@ from scene_envs.datasets import to_union
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar
 from scene_envs.render import picture_camera
+from scene_envs.render.raster import Pinhole
 from scene_envs.render.stage import (
     Frame,
     camera_points,
@@ -156,7 +157,7 @@ def looking_down(height, depth):
     view[2, 3] = -height
     depth = np.asarray(depth, dtype=np.float32)
     slots = np.where(np.isfinite(depth), 0, -1)
-    return Frame(np.zeros((*depth.shape, 3), np.float32), depth, slots, view, np.array([1.0, 1.0]))
+    return Frame(depth, slots, slots, Pinhole(view, np.array([1.0, 1.0]), 0.01, *depth.shape[::-1]))
 
 
 def test_points_of_a_plane_lie_in_it_and_span_the_field_of_view():

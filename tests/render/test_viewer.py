@@ -136,7 +136,6 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
 @pytest.mark.slow
 def test_a_browser_draws_the_objects_where_they_are(browser, tmp_path):
     """Against the pinhole camera, and pixel by pixel against the software renderer."""
-    pytest.importorskip("pybullet")
     batch = scenes()
     page = write_viewer(batch, tmp_path / "viewer.html", title="Three <scenes>")
     shown = browser.open(page, "#scene=2&azimuth=-40&elevation=50&distance=3.5&target=0.1,0,0&select=4")
@@ -152,10 +151,8 @@ def test_a_browser_draws_the_objects_where_they_are(browser, tmp_path):
     target = np.array([0.1, 0.0, 0.0])
     camera = Camera(tuple(target + 3.5 * toward), tuple(target), (0.0, 0.0, 1.0), fov_y=28.0)
     stage = get_stage(DIMSUM.assets)
-    rotations = torch.where(batch.is_empty[2, :, None, None], torch.eye(3), batch.rotations[2])
-    stage.place(
-        batch.translations[2].double().numpy(), matrix_to_quaternion(rotations).numpy(), batch.categories[2].numpy()
-    )
+    poses = (part[2].double().numpy() for part in (batch.translations, batch.rotations))
+    stage.place(*poses, batch.categories[2].numpy())
     slots = stage.look(camera, width, height).slots
     for slot in (-1, 0, 3, 4, 5, 6):
         pixels, x, y = seen["sums"][str(slot)]
@@ -363,7 +360,6 @@ def test_a_prior_and_a_grammar(tmp_path):
 
 @pytest.mark.slow
 def test_pictures_are_drawn_beside_the_page(tmp_path):
-    pytest.importorskip("pybullet")
     assert main(["view", "scene=dimsum_table", "count=2", "pictures=1", f"output={tmp_path / 'a'}"]) == 0
     assert (tmp_path / "a" / "gallery.png").stat().st_size > 1000
 

@@ -169,11 +169,15 @@ def run(settings: EvaluateConfig, run: Run) -> None:
             try:
                 figures = compute_measure(name, inputs)
             except (InvalidInputError, MissingDependencyError) as error:
-                if not optional:
+                if not optional and not isinstance(error, MissingDependencyError):
                     raise
-                results.skipped[name] = str(error)
+                results.left_out[name] = str(error)
                 run.log(f"{name} not measured: {error}")
             else:
+                if inputs.left_out:
+                    parts = (f"{figure} figures: {reason}" for figure, reason in inputs.left_out.items())
+                    results.left_out[name] = "; ".join(parts)
+                    inputs.left_out.clear()
                 if name == "prompts":
                     claims = {"prompt_claim_guidance": settings.claim_guidance} if settings.claim_guidance else {}
                     figures = {"prompt_guidance": settings.guidance, **claims, **figures}
@@ -186,7 +190,8 @@ def run(settings: EvaluateConfig, run: Run) -> None:
 
 
 def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
-    """The identity of the figures in ``metrics.json``, and the figures by group; both empty where there are none.
+    """The identity of the figures in ``metrics.json``, and the figures by group, without groups of which a part was
+    left out; both empty where there are none.
 
     Raises:
         CorruptFileError: the file is cut off, or was changed after it was written.
@@ -196,7 +201,7 @@ def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float
         if found is None:
             return {}, {}
         found = without_digest(found, path)
-        return dict(found["identity"]), dict(found["groups"])
+        return dict(found["identity"]), {k: v for k, v in found["groups"].items() if k not in found["left_out"]}
     except FileNotFoundError:
         return {}, {}
     except CorruptFileError as error:
@@ -220,7 +225,7 @@ class _Results:
 
     def __init__(self, run: Run, identity: dict[str, Any]) -> None:
         self.run_, self.identity = run, identity
-        self.skipped: dict[str, str] = {}
+        self.left_out: dict[str, str] = {}
         self.notes: list[str] = []
         self._sampling = {key: float(identity[key]) for key in ("num_steps", "physics_guidance")}
         path = run.directory / "metrics.json"
@@ -262,7 +267,7 @@ class _Results:
     def write(self) -> None:
         """``metrics.json``: all figures by name, then the same by group."""
         flat = {name: value for figures in self.groups.values() for name, value in figures.items()}
-        evaluation = {"identity": self.identity, "groups": self.groups, "skipped": self.skipped}
+        evaluation = {"identity": self.identity, "groups": self.groups, "left_out": self.left_out}
         self.run_.write_metrics({**self._sampling, **flat, "evaluation": with_digest(evaluation)})
 
     def report(self, groups: list[str]) -> str:
@@ -272,7 +277,7 @@ class _Results:
         self.write()
         measured = {k: v for name in groups for k, v in self.groups.get(name, {}).items() if v is not None}
         figures = {**self._sampling, **measured}
-        notes = [f"- {name} not measured: {reason}" for name, reason in self.skipped.items()]
+        notes = [f"- {name} not measured: {reason}" for name, reason in self.left_out.items()]
         notes += [f"- {text}" for text in self.notes]
         return "\n".join([figure_table(figures), *(["", *notes] if notes else [])])
 
@@ -295,11 +300,8 @@ def _prompted(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str]) -
 
 
 def _draw(samples: SceneBatch, count: int, run: Run) -> None:
-    """Draw ``gallery.png``, if the packages for pictures are installed."""
+    """Draw ``gallery.png``, if there is geometry to draw."""
     if not samples.scene_type.has_geometry:
         run.log(f"no gallery: the assets of {samples.scene_type.name!r} have no geometry here")
         return
-    try:
-        draw_scenes(samples, count, run, "gallery.png")
-    except MissingDependencyError as error:
-        run.log(f"no gallery: {error}")
+    draw_scenes(samples, count, run, "gallery.png")

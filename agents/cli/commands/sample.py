@@ -55,6 +55,7 @@ def check(settings: SampleConfig) -> None:
 
 def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
+    from agents.evaluation.physics_figures import leaving_out
     from agents.priors.guidance import physics_strength
     from rewards.process import close_reward, run_reward
     from scene_envs.export.formats import resolve_formats
@@ -102,7 +103,11 @@ def run(settings: SampleConfig, run: Run) -> None:
     }
     with make_pool(settings.workers, physics=settings.physics) as pool:
         if reward is not None:
-            metrics["reward"] = reward_figures(reward, batch, pool, run)
+            left_out: dict[str, str] = {}
+            with leaving_out("reward", left_out):
+                metrics["reward"] = reward_figures(reward, batch, pool, run)
+            if left_out:
+                metrics["left_out"] = left_out
             close_reward(reward)
         draw_scenes(batch, settings.pictures, run, "gallery.png")
         if settings.project:
