@@ -28,7 +28,7 @@ from agents.evaluation.layouts import (
     tallest_stacks,
     workspace_fraction,
 )
-from agents.evaluation.physics_figures import physics_figures, ready_figures
+from agents.evaluation.physics_figures import physics_figures, ready_figures, stability_figures
 from agents.evaluation.pictures import (
     frechet_inception_distance,
     frechet_scene_distance,
@@ -384,6 +384,7 @@ MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
     "layout": lambda inputs: _with_floor(lambda batch: layout_figures(batch, inputs.real.reference), inputs),
     "physics": lambda inputs: _with_floor(lambda batch: physics_figures(batch, inputs.pool, inputs.left_out), inputs),
     "ready": lambda inputs: _with_floor(lambda batch: ready_figures(batch, inputs.pool), inputs),
+    "stability": lambda inputs: _with_floor(lambda batch: stability_figures(batch, inputs.pool), inputs),
     "fsd": lambda inputs: _with_floor(
         lambda batch: {"frechet_scene_distance": frechet_scene_distance(batch, inputs.real.reference)}, inputs
     ),
@@ -433,6 +434,8 @@ READING: dict[str, str] = {
     "ready_invalid_fraction": "scenes that could not be made ready",
     "ready_objects": "feasible objects per scene after projection and settling; higher is better",
     "ready_fraction": "the same as a share of free objects; higher is better",
+    "stable_2s_invalid_fraction": "scenes that could not be simulated for 2 s",
+    "stable_2s_fraction": "free objects that move < 1 cm and < 0.1 rad in 2 s, nothing removed; higher is better",
     "classifier_accuracy": "accuracy of a set transformer, samples against real scenes; 0.5 is chance, lower is better",
     "classifier_accuracy_std": "its spread over the seeds",
     "render_accuracy": "accuracy of a CNN on their semantic renders; 0.5 is chance, lower is better",

@@ -12,6 +12,7 @@ import torch
 from agents.cli.commands.evaluate import choose_measures
 from agents.evaluation import evaluate, figure_table, grammar_scenes, measure_samples, stable_fraction
 from agents.evaluation.measure import MEASURES, EvaluationInputs, RealScenes, compute_measure
+from agents.evaluation.physics_figures import stability_figures
 from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset, generate
 from scene_envs.errors import InvalidInputError, UnknownNameError
@@ -172,6 +173,22 @@ def test_nothing_to_measure_is_refused(real: SceneBatch) -> None:
 def test_what_is_centimetres_deep_is_not_stable() -> None:
     for depth, stable in ((0.0, 1.0), (0.02, 0.0)):
         assert stable_fraction(one_object("teapot", -depth)) == stable
+
+
+def test_what_falls_less_than_a_centimetre_in_two_seconds_is_stable_as_the_literature_counts() -> None:
+    heights = (0.0, 0.008, 0.5)  # at rest; falls 8 mm onto its foot; falls half a metre
+    batch = build(*[[("teapot", 0.1, 0.1, height)] for height in heights])
+    shares = [stability_figures(batch[row])["stable_2s_fraction"] for row in range(3)]
+    assert shares == [1.0, 1.0, 0.0]
+    assert stability_figures(batch) == {"stable_2s_invalid_fraction": 0.0, "stable_2s_fraction": pytest.approx(2 / 3)}
+    assert stability_figures(SceneBatch.empty("dimsum_table", 1)) == {"stable_2s_invalid_fraction": 0.0}
+
+
+def test_two_of_three_objects_collide_in_one_of_two_scenes() -> None:
+    apart = [("teapot", 0.1, 0.1, 0.0), ("teapot", -0.2, 0.1, 0.0), ("teapot", -0.2, -0.2, 0.0)]
+    figures = measure_samples(build(apart, [*apart[:2], ("teapot", -0.19, 0.1, 0.0)]), build(apart), ready=False)
+    assert figures["collision_rate"] == 1 / 2  # colliding scenes
+    assert figures["deeper_than_1mm_fraction"] == 2 / 6  # colliding objects
 
 
 def save(batch: SceneBatch, folder: Path) -> str:

@@ -57,8 +57,8 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
         claim_guidance: strength with which samples are guided to the numbers and places that their prompts give, 0 for
             none.
         seed: seed of the samples, the real scenes and the classifiers.
-        measures: all, or some of layout, physics, ready, fsd, novelty, prompts, classifier, renders, fid, written as
-            layout or [layout, physics].
+        measures: all, or some of layout, physics, ready, stability, fsd, novelty, prompts, classifier, renders, fid,
+            written as layout or [layout, physics].
         project: include ready, the measures after projection and settling, in all.
         fid_weights: file with the weights of an Inception-v3, for fid.
         pictures: number of samples in gallery.png; 0 draws none.
