@@ -28,6 +28,10 @@ def forked(function: Callable[..., Any], *args: Any) -> ForkProcess:
     return process
 
 
+def _stream(descriptor: int) -> TextIO:
+    return open(descriptor, "w", buffering=1, closefd=False)
+
+
 class ForkedModule:
     """``subprocess.Popen`` of ``python -m MODULE ...``, or of a worker process, as a copy of this process.
 
@@ -77,7 +81,7 @@ class ForkedModule:
         os.dup2(nothing if stdout == subprocess.DEVNULL else stdout, 1)
         if joined:
             os.dup2(1, 2)
-            sys.stdout = sys.stderr = open(1, "w", buffering=1, closefd=False)  # noqa: SIM115
+        sys.stdout, sys.stderr = map(_stream, (1, 2))  # pytest's write elsewhere
         for descriptor in map(int, os.listdir("/proc/self/fd")):
             if descriptor > 2 and descriptor not in kept:
                 with contextlib.suppress(OSError):  # that of the listing is closed already

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
 from agents.configuration.composition import changed
+from agents.evaluation import classifier
+from agents.evaluation.classifier import ClassifierConfig
 from agents.post_training import PostTrainConfig
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
 
+QUICK = ClassifierConfig(epochs=1, batch_size=16)
+"""One pass: no test of a run hangs on how well the classifier of its guard learns."""
 PLACES = {
     "regularisation": "regularisation.weight", "bank_size": "regularisation.bank_size",
     "real_scenes": "regularisation.scenes", "lr": "optimizer.lr", "learning_rate": "optimizer.lr",
     "chunk": "optimizer.chunk", "gradient_steps": "algorithm.gradient_steps",
     "credit": "algorithm.credit", "scenes_per_prompt": "algorithm.scenes_per_prompt",
-    "guard_limit": "guard.limit", "guard_action": "guard.action",
+    "guard_limit": "guard.limit", "guard_every": "guard.every", "guard_action": "guard.action",
 }  # fmt: skip
 """Short names of keys of groups."""
 
@@ -49,3 +57,12 @@ def count_objects(batch: SceneBatch, context: RewardContext) -> RewardOutput:
 def not_a_number(batch: SceneBatch, context: RewardContext) -> RewardOutput:
     """No valid score for any scene."""
     return RewardOutput(torch.full((len(batch),), float("nan")))
+
+
+@contextmanager
+def one_quick_classifier() -> Iterator[None]:
+    """A figure of a guard's samples comes from one classifier of one pass, and not from the mean of three."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("agents.post_training.guard._CLASSIFIERS", 1)
+        patch.setattr(classifier, "classifier_accuracy", partial(classifier.classifier_accuracy, config=QUICK))
+        yield

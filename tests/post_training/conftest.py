@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from PIL import Image
 from agents.post_training import real_scenes as scene_bank
 from agents.priors.prior import ScenePrior
 from scene_envs.scene import SceneBatch
+from tests.helpers.small_runs import one_quick_classifier
 
 _DRAWN: dict[tuple[Any, ...], SceneBatch] = {}
 
@@ -27,6 +29,12 @@ def _blank_curves(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 def _blank(history: object, path: Path, **_: object) -> Path:
     Image.new("L", (1, 1)).save(path)
     return path
+
+
+@pytest.fixture(autouse=True)
+def _one_quick_classifier() -> Iterator[None]:
+    with one_quick_classifier():
+        yield
 
 
 @pytest.fixture(autouse=True)
