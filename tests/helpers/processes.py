@@ -14,7 +14,7 @@ from torch.nn.modules.module import register_module_forward_pre_hook
 
 from agents.post_training import PostTrainConfig, post_train
 from agents.priors.testing import tiny_prior
-from tests.helpers.small_runs import one_quick_classifier
+from tests.helpers.small_runs import one_quick_classifier, scenes_drawn_once
 
 Run = tuple[PostTrainConfig, str, torch.dtype]
 """A configuration, the process of its prior (``continuous`` or ``mixed``), and the dtype of everything."""
@@ -30,7 +30,7 @@ def train(runs: Iterable[Run]) -> None:
         torch.set_default_dtype(dtype)
         hook = register_module_forward_pre_hook(lambda module, inputs: tuple(map(_as_default, inputs)))
         try:
-            with patch("matplotlib.figure.Figure.savefig"), one_quick_classifier():
+            with patch("matplotlib.figure.Figure.savefig"), one_quick_classifier(), scenes_drawn_once():
                 post_train(config, prior=tiny_prior(process=process, text=config.prompt is not None).to(dtype))
         finally:
             hook.remove()

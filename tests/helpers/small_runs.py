@@ -15,6 +15,8 @@ from agents.configuration.composition import changed
 from agents.evaluation import classifier
 from agents.evaluation.classifier import ClassifierConfig
 from agents.post_training import PostTrainConfig
+from agents.post_training import real_scenes as scene_bank
+from agents.priors.prior import ScenePrior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
 
@@ -65,4 +67,27 @@ def one_quick_classifier() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("agents.post_training.guard._CLASSIFIERS", 1)
         patch.setattr(classifier, "classifier_accuracy", partial(classifier.classifier_accuracy, config=QUICK))
+        yield
+
+
+_DRAWN: dict[tuple[Any, ...], SceneBatch] = {}
+
+
+@contextmanager
+def scenes_drawn_once() -> Iterator[None]:
+    """The same scenes of a grammar, which take longer than an iteration, are drawn once per process."""
+    draw = scene_bank.real_scenes
+
+    def once(
+        prior: ScenePrior, source: str, count: int, *, seed: int, slots: int | None = None, progress: str = "none"
+    ) -> tuple[Any, Any]:
+        if source != "grammar":
+            return draw(prior, source, count, seed=seed, slots=slots)
+        key = (prior.scene_type, prior.config.slots, count, seed, slots)
+        if key not in _DRAWN:
+            _DRAWN[key], _ = draw(prior, source, count, seed=seed, slots=slots)
+        return SceneBatch(_DRAWN[key].tensor.clone(), prior.scene_type), None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_bank, "real_scenes", once)
         yield
