@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
 from tests.helpers.small_runs import one_quick_classifier, scenes_drawn_once
@@ -18,6 +20,17 @@ def _blank_curves(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
         return
     request.getfixturevalue("blank_curves")
     monkeypatch.setattr("agents.post_training.trainer.draw_curve", _blank)
+
+
+@pytest.fixture(autouse=True)
+def _blank_scenes(request: pytest.FixtureRequest, _coarse_pictures: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes of reports are blank, but for those of the demonstration."""
+    if "demonstration" not in request.node.name:
+        monkeypatch.setattr("scene_envs.render.pictures._picture", _blank_picture)
+
+
+def _blank_picture(stage: object, camera: object, width: int, height: int, *scene: object) -> NDArray[np.uint8]:
+    return np.zeros((height, width, 3), np.uint8)
 
 
 def _blank(history: object, path: Path, **_: object) -> Path:
