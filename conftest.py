@@ -81,6 +81,18 @@ def _registries_of_test(_registries_of_module: None) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True)
+def _copied_workers_of_doctest(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Workers of an example start as copies of this process: a new interpreter imports for seconds."""
+    if not isinstance(request.node, pytest.DoctestItem):
+        yield
+        return
+    from tests.helpers.forked import forked_workers
+
+    with forked_workers():
+        yield
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collect_file(file_path: Path) -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
     """Modules of tests have no doctests; to look for some in all that they import takes a second."""

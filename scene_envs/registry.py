@@ -28,9 +28,20 @@ def plugin_entry_points(group: str) -> dict[str, EntryPoint]:
     """The entry points of ``group`` by name, of all installed packages. Those that the ``pyproject.toml`` of a checkout
     declares replace installed ones, because the metadata of an editable install may be out of date or missing.
     """
-    installed = {point.name: point for point in entry_points(group=group)}
+    places = [(place, place or os.curdir) for place in sys.path]
+    installed = _installed_entry_points(
+        group, tuple((place, os.stat(path).st_mtime_ns) for place, path in places if os.path.exists(path))
+    )
     declared = _checkout_entry_points(Path(__file__).parents[1] / "pyproject.toml").get(group, {})
     return installed | {name: EntryPoint(name, value, group) for name, value in declared.items()}
+
+
+@cache
+def _installed_entry_points(group: str, places: tuple[tuple[str, int], ...]) -> dict[str, EntryPoint]:
+    """Read once, as the metadata of all packages are read for it, until a folder of the import path, whose times of
+    change are in ``places``, is another or gets a package.
+    """
+    return {point.name: point for point in entry_points(group=group)}
 
 
 @cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -124,13 +125,17 @@ def test_every_option_of_a_group_composes() -> None:
     """Each option with one command at least, and each group of a command with one option at least."""
     seen: set[tuple[str, str]] = set()
     for command in SMALLEST_FIRST:
+        columns = []
         for field in dataclasses.fields(CONFIGS[command]):
             if folder := field.metadata.get("folder"):
                 options = list(field_options(field))
                 assert options
-                for option in [option for option in options if (folder, option) not in seen] or options[:1]:
-                    assert isinstance(compose(command, CONFIGS[command], [f"{field.name}={option}"]), CONFIGS[command])
+                new = [option for option in options if (folder, option) not in seen] or options[:1]
+                columns.append([f"{field.name}={option}" for option in new])
                 seen |= {(folder, option) for option in options}
+        for words in itertools.zip_longest(*columns):  # an option of every group at once
+            given = [word for word in words if word]
+            assert isinstance(compose(command, CONFIGS[command], given), CONFIGS[command])
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import warnings
-from importlib.metadata import EntryPoints
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,7 @@ def test_unknown_names_offer_the_nearest() -> None:
 
 def test_entry_points_of_a_checkout_do_not_depend_on_installed_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
     """An editable install keeps the metadata of the day it was made."""
-    monkeypatch.setattr(plugins, "entry_points", lambda group: EntryPoints())
+    monkeypatch.setattr(plugins, "_installed_entry_points", lambda group, places: {})
     assert set(plugins.plugin_entry_points(resolvers.ENTRY_POINT_GROUP)) == {"prior", "reward"}
 
 

@@ -245,7 +245,7 @@ def scenes() -> SceneBatch:
 
 @pytest.mark.slow
 def test_real_against_real_is_near_chance(scenes: SceneBatch) -> None:
-    accuracy = render_classifier_accuracy(scenes[:60], scenes[60:], seeds=2, config=QUICK, **SIZE)
+    accuracy = render_classifier_accuracy(scenes[:60], scenes[60:], seeds=1, config=QUICK, **SIZE)
     assert accuracy.mean == pytest.approx(0.5, abs=0.2)  # 56 held-out renders a seed: 7 % standard error
 
 

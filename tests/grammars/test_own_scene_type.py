@@ -111,6 +111,7 @@ def test_prompts_are_true_of_the_scenes(folder: Path) -> None:
         assert parse_prompt(prompt, NAME).holds(facts), prompt
 
 
+@pytest.mark.usefixtures("copied_workers")
 def test_physics_in_a_pool_is_physics_here(batch: SceneBatch) -> None:
     here = feasibility(batch[:4])
     with PhysicsPool(workers=1) as pool:

@@ -7,13 +7,14 @@ import faulthandler
 import multiprocessing
 import os
 import runpy
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing.context import ForkProcess
-from types import SimpleNamespace
-from typing import Any
+from types import ModuleType, SimpleNamespace
+from typing import Any, TextIO
 
 import pytest
 
@@ -27,6 +28,10 @@ def forked(function: Callable[..., Any], *args: Any) -> ForkProcess:
     return process
 
 
+def _stream(descriptor: int) -> TextIO:
+    return open(descriptor, "w", buffering=1, closefd=False)
+
+
 class ForkedModule:
     """``subprocess.Popen`` of ``python -m MODULE ...``, or of a worker process, as a copy of this process.
 
@@ -38,13 +43,18 @@ class ForkedModule:
         self,
         command: Sequence[str],
         *,
-        pass_fds: Sequence[int],
+        pass_fds: Sequence[int] = (),
         env: Mapping[str, str],
         start_new_session: bool = False,
         stdout: int = subprocess.DEVNULL,
+        stderr: int | None = None,
         **_: Any,
     ) -> None:
         self.returncode: int | None = None
+        self.stdout: TextIO | None = None
+        if stdout == subprocess.PIPE:
+            read, stdout = os.pipe()
+            self.stdout = os.fdopen(read)
         option = command[1]
         assert option in ("-c", "-m")
         self._module, *self._words = command[2:] if option == "-m" else ("", *command[3:])
@@ -53,20 +63,25 @@ class ForkedModule:
         self.pid = os.fork()
         if self.pid == 0:
             try:
-                self._run(pass_fds, env, start_new_session, stdout)
+                self._run(pass_fds, env, start_new_session, stdout, stderr == subprocess.STDOUT)
             except SystemExit as end:
                 os._exit(end.code if isinstance(end.code, int) else 0 if end.code is None else 1)
             except BaseException:
                 os._exit(1)
             os._exit(0)
+        if self.stdout is not None:
+            os.close(stdout)
 
-    def _run(self, kept: Sequence[int], env: Mapping[str, str], new_session: bool, stdout: int) -> None:
+    def _run(self, kept: Sequence[int], env: Mapping[str, str], new_session: bool, stdout: int, joined: bool) -> None:
         faulthandler.disable()
         if new_session:
             os.setsid()
         nothing = os.open(os.devnull, os.O_RDWR)
         os.dup2(nothing, 0)
         os.dup2(nothing if stdout == subprocess.DEVNULL else stdout, 1)
+        if joined:
+            os.dup2(1, 2)
+        sys.stdout, sys.stderr = map(_stream, (1, 2))  # pytest's write elsewhere
         for descriptor in map(int, os.listdir("/proc/self/fd")):
             if descriptor > 2 and descriptor not in kept:
                 with contextlib.suppress(OSError):  # that of the listing is closed already
@@ -98,13 +113,18 @@ class ForkedModule:
     def kill(self) -> None:
         """SIGKILL."""
         if self.poll() is None:
-            os.kill(self.pid, 9)
+            os.kill(self.pid, signal.SIGKILL)
+
+    def terminate(self) -> None:
+        """SIGTERM."""
+        if self.poll() is None:
+            os.kill(self.pid, signal.SIGTERM)
 
 
 @contextlib.contextmanager
-def forked_workers() -> Iterator[None]:
-    """Worker processes that start meanwhile are copies of this process."""
+def forked_workers(module: ModuleType = workers) -> Iterator[None]:
+    """Processes that a module starts meanwhile, workers by default, are copies of this process."""
     stand_in = SimpleNamespace(**{**vars(subprocess), "Popen": ForkedModule})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workers, "subprocess", stand_in)
+        patch.setattr(module, "subprocess", stand_in)
         yield

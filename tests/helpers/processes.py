@@ -14,6 +14,7 @@ from torch.nn.modules.module import register_module_forward_pre_hook
 
 from agents.post_training import PostTrainConfig, post_train
 from agents.priors.testing import tiny_prior
+from tests.helpers.small_runs import one_quick_classifier, scenes_drawn_once
 
 Run = tuple[PostTrainConfig, str, torch.dtype]
 """A configuration, the process of its prior (``continuous`` or ``mixed``), and the dtype of everything."""
@@ -22,14 +23,14 @@ Run = tuple[PostTrainConfig, str, torch.dtype]
 def train(runs: Iterable[Run]) -> None:
     """Post-train untrained priors, which read prompts where a run has some.
 
-    Nobody looks at the curves, and one classifier measures samples as well as three.
+    Nobody looks at the curves.
     """
     for config, process, dtype in runs:
         before = torch.get_default_dtype()
         torch.set_default_dtype(dtype)
         hook = register_module_forward_pre_hook(lambda module, inputs: tuple(map(_as_default, inputs)))
         try:
-            with patch("matplotlib.figure.Figure.savefig"), patch("agents.post_training.guard._CLASSIFIERS", 1):
+            with patch("matplotlib.figure.Figure.savefig"), one_quick_classifier(), scenes_drawn_once():
                 post_train(config, prior=tiny_prior(process=process, text=config.prompt is not None).to(dtype))
         finally:
             hook.remove()
@@ -44,13 +45,12 @@ def _as_default(x: Any) -> Any:
 def in_processes(function: Callable[..., None], *arguments: Any, count: int = 2) -> list[int]:
     """Call ``function`` in ``count`` processes that find each other as under ``torchrun``; returns their statuses.
 
-    They begin as copies of a process that has imported what a run needs and done nothing else.
+    They begin as copies of this process, which has imported what a run needs.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": str(count)}
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__, "scene_envs.assets.library", "matplotlib.figure", "scipy.stats"])
+    context = multiprocessing.get_context("fork")
     processes = [
         context.Process(target=_launched, args=({"RANK": str(rank), **address}, function, arguments))
         for rank in range(count)

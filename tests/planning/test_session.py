@@ -64,7 +64,7 @@ def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def prior() -> ScenePrior:
-    return tiny_prior()
+    return tiny_prior(slots=12)
 
 
 @pytest.mark.slow

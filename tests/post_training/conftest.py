@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
-from agents.post_training import real_scenes as scene_bank
-from agents.priors.prior import ScenePrior
-from scene_envs.scene import SceneBatch
-
-_DRAWN: dict[tuple[Any, ...], SceneBatch] = {}
+from tests.helpers.small_runs import one_quick_classifier, scenes_drawn_once
 
 
 @pytest.fixture(autouse=True)
@@ -24,24 +22,29 @@ def _blank_curves(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("agents.post_training.trainer.draw_curve", _blank)
 
 
+@pytest.fixture(autouse=True)
+def _blank_scenes(request: pytest.FixtureRequest, _coarse_pictures: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes of reports are blank, but for those of the demonstration."""
+    if "demonstration" not in request.node.name:
+        monkeypatch.setattr("scene_envs.render.pictures._picture", _blank_picture)
+
+
+def _blank_picture(stage: object, camera: object, width: int, height: int, *scene: object) -> NDArray[np.uint8]:
+    return np.zeros((height, width, 3), np.uint8)
+
+
 def _blank(history: object, path: Path, **_: object) -> Path:
     Image.new("L", (1, 1)).save(path)
     return path
 
 
 @pytest.fixture(autouse=True)
-def _scenes_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same scenes of a grammar, which take longer than an iteration, are drawn once per process."""
-    draw = scene_bank.real_scenes
+def _one_quick_classifier() -> Iterator[None]:
+    with one_quick_classifier():
+        yield
 
-    def once(
-        prior: ScenePrior, source: str, count: int, *, seed: int, slots: int | None = None, progress: str = "none"
-    ) -> tuple[Any, Any]:
-        if source != "grammar":
-            return draw(prior, source, count, seed=seed, slots=slots)
-        key = (prior.scene_type, prior.config.slots, count, seed, slots)
-        if key not in _DRAWN:
-            _DRAWN[key], _ = draw(prior, source, count, seed=seed, slots=slots)
-        return SceneBatch(_DRAWN[key].tensor.clone(), prior.scene_type), None
 
-    monkeypatch.setattr(scene_bank, "real_scenes", once)
+@pytest.fixture(autouse=True)
+def _scenes_drawn_once() -> Iterator[None]:
+    with scenes_drawn_once():
+        yield

@@ -33,7 +33,7 @@ def disturbed(batch: SceneBatch, seed: int) -> tuple[SceneBatch, torch.Tensor]:
 @pytest.fixture(scope="module")
 def trained() -> Discriminator:
     grammar = get_grammar("dimsum_table")
-    reward = Discriminator()
+    reward = Discriminator(batch_size=24)
     reward.begin(grammar.sample(np.random.default_rng(0), 96), seed=0)
     reward.learn(disturbed(grammar.sample(np.random.default_rng(1), 96), 1)[0], steps=80)
     return reward
@@ -61,7 +61,7 @@ def test_furniture_of_rooms_is_judged_and_does_not_change_the_value() -> None:
     grammar = get_grammar("restaurant_low_clutter")
     real, samples = (grammar.sample(np.random.default_rng(seed), 12) for seed in (0, 1))
     shift = torch.tensor([0.0, 0.0, 0.3]) * samples.is_furniture[..., None]
-    reward = Discriminator()
+    reward = Discriminator(batch_size=16)
     reward.begin(real, seed=0)
     reward.learn(samples.with_poses(samples.translations + shift, samples.rotations), steps=60)
     output = reward(samples, RewardContext())
@@ -131,11 +131,12 @@ def test_the_parts_of_a_composite_that_learn_are_found() -> None:
 
 def test_a_resumed_run_equals_one_without_a_break(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learned_rewards, "FIRST_STEPS", 5)
-    reward = {"name": "clip", "reward": "discriminator", "high": 0.9}
+    judge = {"name": "discriminator", "steps": 3, "batch_size": 12}
+    reward = {"name": "clip", "reward": judge, "high": 0.9}
     prior = tiny_prior(process="mixed")
-    whole = post_train(small_config(tmp_path / "whole", reward=reward, iterations=3), prior=prior)
-    post_train(small_config(tmp_path / "parts", reward=reward, iterations=2), prior=prior)
-    parts = post_train(small_config(tmp_path / "parts", reward=reward, iterations=3), prior=prior)
+    whole = post_train(small_config(tmp_path / "whole", reward=reward, guard_every=1, iterations=2), prior=prior)
+    post_train(small_config(tmp_path / "parts", reward=reward, guard_every=1, iterations=1), prior=prior)
+    parts = post_train(small_config(tmp_path / "parts", reward=reward, guard_every=1, iterations=2), prior=prior)
     rewards = [[row["reward"] for row in result.history] for result in (whole, parts)]
     assert rewards[0] == rewards[1]
     assert len(set(rewards[0])) > 1

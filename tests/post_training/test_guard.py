@@ -26,12 +26,6 @@ from tests.helpers.small_runs import small_config
 SAMPLES = {"guard.scenes": 20, "guard.samples": 20, "guard.samples_every": 2, "bank_size": 40}
 
 
-@pytest.fixture(autouse=True)
-def _one_classifier(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A figure of samples comes from one classifier and not from the mean of three."""
-    monkeypatch.setattr("agents.post_training.guard._CLASSIFIERS", 1)
-
-
 def trainer(path: Path, **changes: object) -> PostTrainer:
     """A prepared run whose base prior has been measured."""
     made = PostTrainer(small_config(path, **(SAMPLES | changes)), prior=tiny_prior())

@@ -34,7 +34,7 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
     "ddpo_is": (
         "mixed",
         torch.float64,
-        {"algorithm": {"updates": 2, "scenes_per_prompt": 3}, "prompt": TWO, "reward": "diversity"},
+        {"algorithm": {"updates": 2, "scenes_per_prompt": 3}, "prompt": TWO, "reward": "diversity", "iterations": 1},
     ),
     "nft": (
         "mixed",
@@ -49,7 +49,7 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
     "awm": (
         "continuous",
         torch.float32,
-        {"guard": {"action": "rollback", "limit": 0.5, "scenes": 20, "samples": 20}, "iterations": 3, "bank_size": 30},
+        {"guard": {"action": "rollback", "limit": 0.5, "every": 1, "scenes": 20, "samples": 20}, "bank_size": 30},
     ),
     "guidance_distillation": (
         "mixed",
@@ -120,8 +120,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with FileLock(f"{path}.lock"):
         if not (path / "done").exists():
             failing = small_config(path / "failing", reward=fails_elsewhere, iterations=2), "continuous", torch.float32
+            train(runs(path / "one", chunk=3))  # first: the copies know what it imported and drew
             assert in_processes(train, [*runs(path / "two", chunk=None), failing]) == [0, 0]
-            train(runs(path / "one", chunk=3))
             (path / "done").touch()
     return path
 

@@ -13,8 +13,8 @@ import torch
 from PIL import Image
 from rich.console import Console
 
+from agents.post_training import demo, post_train_and_compare
 from agents.post_training import learner as learned_rewards
-from agents.post_training import post_train_and_compare
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
 from agents.post_training.report import Page, Picture, Section, Tile, load_learned_rewards, measure_prior, write_report
@@ -26,6 +26,7 @@ from rewards import make_reward
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
+from tests.helpers.forked import forked_workers
 from tests.helpers.simulators import no_simulator
 from tests.helpers.small_runs import count_objects, small_config
 
@@ -125,11 +126,16 @@ def test_demonstration_end_to_end(tmp_path: Path, capfd: pytest.CaptureFixture[s
     small = [f"prior={tiny_prior(slots=6).save(tmp_path / 'base')}", "batch_size=4", "num_steps=3", "iterations=1",
              "regularisation.bank_size=20", "regularisation.batch_size=4", "guard.scenes=8"]  # fmt: skip
     runs = {"clutter": small, "feasible": [*small, "algorithm=nft", "reward=feasible_share"]}
-    folder = tmp_path / "demo"
+    folder, wrong = tmp_path / "demo", [*small, "algorithm=ntf"]
     with pytest.raises(TrainingError, match="the run 'feasible' ended with status 2"):
-        run_demo(folder, workers=0, scenes=2, num_steps=4, runs={**runs, "feasible": [*small, "algorithm=ntf"]})
+        run_demo(tmp_path / "refused", workers=0, runs={"feasible": wrong})
     assert "feasible: scene-envs: unknown" in capfd.readouterr().err
-    metrics = run_demo(folder, workers=0, scenes=2, num_steps=4, runs=runs)  # finds the first run, which is finished
+    with forked_workers(demo):
+        with pytest.raises(TrainingError, match="the run 'feasible' ended with status 2"):
+            run_demo(folder, workers=0, scenes=2, num_steps=4, runs={**runs, "feasible": wrong})
+        metrics = run_demo(
+            folder, workers=0, scenes=2, num_steps=4, runs=runs
+        )  # finds the first run, which is finished
     on_disk = json.loads((folder / "metrics.json").read_text())
     assert on_disk["runs"]["clutter"]["guard"]["ratio"] == metrics["runs"]["clutter"]["guard"]["ratio"]
     priors = {"base": tiny_prior(slots=6), **{name: ScenePrior.load(folder / name) for name in runs}}

@@ -119,10 +119,10 @@ def test_rows_go_to_the_logger_that_is_named(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"credit": "scene"}, {"algorithm": "ddpo_is"}])
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, changes: dict) -> None:
-    whole = post_train(small_config(tmp_path / "whole", iterations=3, **changes), prior=tiny_prior())
-    post_train(small_config(tmp_path / "parts", iterations=2, **changes), prior=tiny_prior())
+    whole = post_train(small_config(tmp_path / "whole", guard_every=1, iterations=2, **changes), prior=tiny_prior())
+    post_train(small_config(tmp_path / "parts", guard_every=1, iterations=1, **changes), prior=tiny_prior())
     torch.randn(7)  # the global generator has moved on
-    parts = post_train(small_config(tmp_path / "parts", iterations=3, **changes), prior=tiny_prior())
+    parts = post_train(small_config(tmp_path / "parts", guard_every=1, iterations=2, **changes), prior=tiny_prior())
     ours, theirs = weights(tmp_path / "parts"), weights(tmp_path / "whole")
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
     assert without_seconds(parts.history) == without_seconds(whole.history)
@@ -551,10 +551,10 @@ def test_the_text_encoder_stays_as_it_is(tmp_path: Path, prompt: str | None) -> 
 @pytest.mark.slow
 def test_stopped_and_resumed_prompted_run_equals_the_uninterrupted_one(tmp_path: Path) -> None:
     changes = {"prompt": "data", "scenes_per_prompt": 2, "reward": count_objects}
-    post_train(small_config(tmp_path / "whole", iterations=3, **changes), prior=reader())
-    post_train(small_config(tmp_path / "parts", iterations=2, **changes), prior=reader())
+    post_train(small_config(tmp_path / "whole", guard_every=1, iterations=2, **changes), prior=reader())
+    post_train(small_config(tmp_path / "parts", guard_every=1, iterations=1, **changes), prior=reader())
     torch.randn(7)
-    post_train(small_config(tmp_path / "parts", iterations=3, **changes), prior=reader())
+    post_train(small_config(tmp_path / "parts", guard_every=1, iterations=2, **changes), prior=reader())
     ours, theirs = weights(tmp_path / "parts"), weights(tmp_path / "whole")
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 

@@ -207,10 +207,10 @@ def test_what_a_thing_carries_goes_with_it() -> None:
 def test_relations_are_followed_by_samples() -> None:
     prior = ScenePrior.load("dimsum_table")
     rng = np.random.default_rng(0)
-    prompts = describe(get_grammar("dimsum_table").sample(rng, 32), rng, kinds=["relations"])
+    prompts = describe(get_grammar("dimsum_table").sample(rng, 16), rng, kinds=["relations"])
 
     def share(strength: float) -> float:
-        batch = prior.sample(32, prompt=prompts, claim_guidance=strength, num_steps=20, seed=0)
+        batch = prior.sample(16, prompt=prompts, claim_guidance=strength, num_steps=12, seed=0)
         checks = [parse_prompt(p, "dimsum_table").check(s) for p, s in zip(prompts, scene_facts(batch), strict=True)]
         return float(np.mean([check.holds for claims in checks for check in claims]))
 

@@ -1,5 +1,6 @@
 """An installed reward package, and scenes whose scores are known."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock
 
 from scene_envs import SceneBatch
 
@@ -16,11 +18,15 @@ PLUGIN = Path(__file__).parents[1] / "plugin_package"
 @pytest.fixture(scope="session")
 def plugin_site(tmp_path_factory) -> Path:
     """A folder into which pip has installed the plug-in package, without network."""
-    copy, site = tmp_path_factory.mktemp("source") / "plugin", tmp_path_factory.mktemp("site")
-    shutil.copytree(PLUGIN, copy)  # pip leaves build products beside the source
-    options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
-    command = [sys.executable, "-m", "pip", "install", *options, "--target", str(site), str(copy)]
-    subprocess.run(command, check=True, capture_output=True, text=True)
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base  # one for all workers
+    copy, site = base / "plugin", base / "plugin_site"
+    with FileLock(f"{site}.lock"):
+        if not site.exists():
+            shutil.copytree(PLUGIN, copy)  # pip leaves build products beside the source
+            options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
+            command = [sys.executable, "-m", "pip", "install", *options, "--target", str(site), str(copy)]
+            subprocess.run(command, check=True, capture_output=True, text=True)
     return site
 
 

@@ -3,6 +3,7 @@
 import os
 import random
 import re
+import shutil
 import time
 from pathlib import Path
 
@@ -150,7 +151,7 @@ def test_limits_are_positive_numbers(limits):
 
 
 @pytest.mark.slow
-def test_scores_of_a_worker_are_those_of_this_process_bit_for_bit(cups):
+def test_scores_of_a_worker_are_those_of_this_process_bit_for_bit_and_its_end_prints_no_traceback(cups, capfd):
     allow_local_rewards(FILE)
     with IsolatedReward(f"{FILE}:named", timeout=60, seed=5) as reward:
         for name in ("honest", "noisy"):
@@ -159,6 +160,9 @@ def test_scores_of_a_worker_are_those_of_this_process_bit_for_bit(cups):
             there = [evaluate_reward(reward, cups, context) for _ in range(2)]
             assert torch.equal(here.value, there[0].value)
             assert torch.equal(here.value, there[1].value)
+        output = evaluate_reward(reward, cups, RewardContext(prompts=("closes_pipes", "closes_pipes")))
+    assert output.valid.tolist() == [False, False]
+    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.fixture(scope="module")
@@ -204,15 +208,6 @@ def test_a_hostile_reward_costs_its_scenes_and_nothing_else(name, message, cups,
 
 
 @pytest.mark.slow
-def test_a_reward_that_closes_its_pipes_prints_no_traceback(cups, capfd):
-    allow_local_rewards(FILE)
-    with IsolatedReward(f"{FILE}:named", timeout=60) as reward:
-        output = evaluate_reward(reward, cups, RewardContext(prompts=("closes_pipes", "closes_pipes")))
-    assert output.valid.tolist() == [False, False]
-    assert "Traceback" not in capfd.readouterr().err
-
-
-@pytest.mark.slow
 @pytest.mark.usefixtures("copied_workers")
 def test_a_reward_that_forks_answers_once_for_each_batch(cups, worker):
     for batch in (cups, cups.with_slots(9), cups[:1]):
@@ -222,12 +217,16 @@ def test_a_reward_that_forks_answers_once_for_each_batch(cups, worker):
         )
 
 
-@pytest.mark.slow
-def test_a_file_that_draws_when_it_is_imported_gives_the_same_in_every_process(cups):
-    allow_local_rewards(FILE)
+@pytest.mark.usefixtures("copied_workers")
+def test_a_file_that_draws_when_it_is_imported_gives_the_same_in_every_process(cups, tmp_path):
+    """Whatever the process drew before it imports the file, which is new to it."""
+    file = Path(shutil.copy(FILE, tmp_path / "draws.py"))
+    allow_local_rewards(file)
     values = []
-    for _ in range(2):
-        with IsolatedReward(f"{FILE}:DrawsWhenMade", seed=5) as reward:
+    for seed in range(2):
+        random.seed(seed)
+        torch.manual_seed(seed)
+        with IsolatedReward(f"{file}:DrawsWhenMade", seed=5) as reward:
             values.append(evaluate_reward(reward, cups).value)
     assert torch.equal(*values)
 
