@@ -35,8 +35,9 @@ _PART_PAIRS = {"cuda": 1 << 18, "cpu": 1 << 15}
 """Most pairs of parts whose depths are computed at a time (6 kB each); a single object pair may not have more."""
 _PAIR_WORLDS = {"cuda": 1 << 14, "cpu": 1 << 10}
 """Most object pairs of a launch, and rows of the arrays per world: kernels depend on the number of rows."""
-_SAME_CENTER, _ASIDE = 1e-4, (5e-7, 6e-7, 6e-7)
-"""Parts whose centres coincide to the first (m) can be missed; one object of such a pair is moved by the second (m)."""
+_ASIDE = (4.8e-7, 6.0e-7, 6.4e-7)
+"""The second object of a pair is moved by this (m) and its depths are corrected by it: parts that lie on one axis or
+have one centre are missed otherwise."""
 
 
 @dataclass(frozen=True)
@@ -178,11 +179,9 @@ class WarpEngine:
         with self._compiling("overlaps"):
             categories = torch.stack([first, second], dim=1)
             library.fill(wp, model, _padded(library.mesh[categories].flatten(1), most, -1), categories)
+            aside = torch.tensor(_ASIDE, dtype=torch.float64, device=self.device)
             position, turn = library.position[categories], library.rotation[categories]  # (P, 2, K, ...)
-            other = _turned(rotation[:, None], position[:, 1]) + translation[:, None]
-            apart = torch.where(library.mesh[first][:, :, None] < 0, math.inf, torch.cdist(position[:, 0], other))
-            same = torch.where(library.mesh[second][:, None] < 0, math.inf, apart).amin(dim=(1, 2)) < _SAME_CENTER
-            other = other + same[:, None, None] * torch.tensor(_ASIDE, device=self.device)
+            other = _turned(rotation[:, None], position[:, 1]) + translation[:, None] + aside
             placed = torch.stack([position[:, 0], other], 1)
             turned = torch.stack([turn[:, 0], rotation[:, None] @ turn[:, 1]], 1)
             limit = 16 * worlds
@@ -199,7 +198,8 @@ class WarpEngine:
                     return None
         contacts = slice(0, int(wp.to_torch(data.nacon)))
         world = wp.to_torch(data.contact.worldid)[contacts].long()
-        deep = -wp.to_torch(data.contact.dist)[contacts].double()
+        away = wp.to_torch(data.contact.frame)[contacts, 0].double()
+        deep = away @ aside - wp.to_torch(data.contact.dist)[contacts].double()
         pair = wp.to_torch(data.contact.geom)[contacts].long()
         number = pair[:, 0] * 2 * parts + pair[:, 1]  # of equal depths, that of the first pair of parts gives the normal
         depth = torch.zeros(worlds, dtype=torch.float64, device=self.device).scatter_reduce(0, world, deep, "amax")
@@ -208,7 +208,7 @@ class WarpEngine:
         chosen = chosen.scatter_reduce(0, world[best], number[best], "amin")
         best &= number == chosen[world]
         normal = torch.zeros(worlds, 3, dtype=torch.float64, device=self.device)
-        normal[world[best]] = wp.to_torch(data.contact.frame)[contacts][best, 0].double()
+        normal[world[best]] = away[best]
         return depth[:count], normal[:count]
 
     def _model(self, key: Any, build: Any) -> _Model:
