@@ -25,6 +25,7 @@ from scene_envs.arrays import Array
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.physics.parts import FRICTION, GRAVITY, principal_inertia
 from scene_envs.progress import Progress
+from scene_envs.rotations import matrix_to_quaternion, quaternion_to_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
@@ -35,6 +36,16 @@ _PART_PAIRS = {"cuda": 1 << 18, "cpu": 1 << 15}
 """Most pairs of parts whose depths are computed at a time (6 kB each); a single object pair may not have more."""
 _PAIR_WORLDS = {"cuda": 1 << 14, "cpu": 1 << 10}
 """Most object pairs of a launch, and rows of the arrays per world: kernels depend on the number of rows."""
+_SCENE_WORLDS = {"cuda": 1024, "cpu": 32}
+"""Most scenes of a launch."""
+_BODIES = (4, 8, 16, 24, 32, 48, 64, 96, 128)
+"""Numbers of free bodies of a model; kernels depend on it."""
+_CONSTRAINTS = 1 << 13
+"""Most rows of constraints of a scene, three per contact."""
+TIMESTEP = 0.002
+"""Time step (s) of motion; this and the next two are those of exported MJCF."""
+_SOLREF, _SOLIMP = [0.004, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
+"""Stiffness of contacts."""
 _ASIDE = (4.8e-7, 6.0e-7, 6.4e-7)
 """The second object of a pair is moved by this (m) and its depths are corrected by it: parts that lie on one axis or
 have one centre are missed otherwise."""
@@ -86,19 +97,30 @@ class WarpEngine:
         if self.device.type == "cuda" and not torch.cuda.is_available():
             raise InvalidInputError(f"device {str(device)!r} was asked for, but torch finds no CUDA GPU; use 'cpu'")
         self._mujoco, self._mjw, self._wp = _modules()
+        self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self._library = _Library(self._mujoco, self._mjw, scene_type, self.device, self._scope)
         self._models: dict[Any, Any] = {}
 
     @contextmanager
     def _scope(self) -> Iterator[None]:
-        """Launch on the device, and on torch's current stream of it."""
-        wp, cuda = self._wp, self.device.type == "cuda"
-        stream = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.device))) if cuda else nullcontext()
-        with wp.ScopedDevice(wp.device_from_torch(self.device)), stream, torch.no_grad():
-            yield
+        """Torch and Warp launch on one stream of the device, which can be captured, after and before all other work."""
+        wp = self._wp
+        with torch.no_grad(), wp.ScopedDevice(wp.device_from_torch(self.device)):
+            if self._stream is None:
+                yield
+                return
+            outside = torch.cuda.current_stream(self.device)
+            self._stream.wait_stream(outside)
+            with torch.cuda.stream(self._stream), wp.ScopedStream(wp.stream_from_torch(self._stream)):
+                yield
+            outside.wait_stream(self._stream)
 
     def overlaps(self, batch: SceneBatch) -> Overlaps:
         """Overlapping object pairs of every scene and their depths; independent of slots and of other scenes."""
+        with self._scope():
+            return self._overlaps(batch)
+
+    def _overlaps(self, batch: SceneBatch) -> Overlaps:
         state = _State(batch, self.device)
         scene, one, two = self._near(state)
         category = state.category[scene, one], state.category[scene, two]
@@ -154,18 +176,16 @@ class WarpEngine:
         normal = torch.zeros(len(scene), 3, dtype=torch.float64, device=self.device)
         lost = torch.zeros(len(scene), dtype=torch.bool, device=self.device)
         most = _PAIR_WORLDS[self.device.type]
-        with self._scope():
-            open_rows = [slice(start, min(start + most, len(scene))) for start in range(0, len(scene), most)][::-1]
-            while open_rows:
-                rows = open_rows.pop()
-                found = self._launch_pairs(first[rows], second[rows], relative[rows], moved[rows])
-                if found is not None:
-                    depth[rows], normal[rows] = found
-                elif rows.stop - rows.start == 1:
-                    lost[rows] = True
-                else:
-                    middle = (rows.start + rows.stop) // 2
-                    open_rows += [slice(middle, rows.stop), slice(rows.start, middle)]
+        open_rows = [slice(start, min(start + most, len(scene))) for start in range(0, len(scene), most)][::-1]
+        while open_rows:
+            rows = open_rows.pop()
+            found = self._launch_pairs(first[rows], second[rows], relative[rows], moved[rows])
+            if found is not None:
+                depth[rows], normal[rows] = found
+            elif rows.stop - rows.start == 1:
+                lost[rows] = True
+            else:
+                open_rows += _halves(rows)
         return depth, _turned(turn, normal), lost
 
     def _launch_pairs(
@@ -178,7 +198,8 @@ class WarpEngine:
         model = self._model("pairs", lambda: _two_bodies(self._mujoco, parts))
         with self._compiling("overlaps"):
             categories = torch.stack([first, second], dim=1)
-            library.fill(wp, model, _padded(library.mesh[categories].flatten(1), most, -1), categories)
+            part = torch.arange(parts, device=self.device).repeat(2)
+            library.fill(wp, model.device, categories.repeat_interleave(parts, dim=1), part, most)
             aside = torch.tensor(_ASIDE, dtype=torch.float64, device=self.device)
             position, turn = library.position[categories], library.rotation[categories]  # (P, 2, K, ...)
             other = _turned(rotation[:, None], position[:, 1]) + translation[:, None] + aside
@@ -201,7 +222,9 @@ class WarpEngine:
         away = wp.to_torch(data.contact.frame)[contacts, 0].double()
         deep = away @ aside - wp.to_torch(data.contact.dist)[contacts].double()
         pair = wp.to_torch(data.contact.geom)[contacts].long()
-        number = pair[:, 0] * 2 * parts + pair[:, 1]  # of equal depths, that of the first pair of parts gives the normal
+        number = (
+            pair[:, 0] * 2 * parts + pair[:, 1]
+        )  # of equal depths, that of the first pair of parts gives the normal
         depth = torch.zeros(worlds, dtype=torch.float64, device=self.device).scatter_reduce(0, world, deep, "amax")
         best = deep == depth[world]
         chosen = torch.full((worlds,), 4 * parts * parts, device=self.device)
@@ -210,6 +233,134 @@ class WarpEngine:
         normal = torch.zeros(worlds, 3, dtype=torch.float64, device=self.device)
         normal[world[best]] = away[best]
         return depth[:count], normal[:count]
+
+    def simulate(
+        self,
+        batch: SceneBatch,
+        duration: float,
+        *,
+        tilt: tuple[float, float] = (0.0, 0.0),
+        damping: float = 0.0,
+        progress: str | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Motion of every scene under gravity; independent of slots.
+
+        Args:
+            batch: B scenes of N slots; welded objects stay where they are.
+            duration: Simulated time, s; steps of 2 ms.
+            tilt: Angles (x, y), rad, by which gravity is tilted.
+            damping: Fraction of velocity that objects lose per second.
+            progress: Style of progress, one of :data:`scene_envs.progress.STYLES`; None shows none.
+
+        Returns:
+            Translations (B, N, 3) m and rotations (B, N, 3, 3) float32 at the end, and validity (B,) bool: False where a
+            pose is not finite, the simulation diverged, or there were more contacts than fit. Poses are unchanged there.
+
+        Raises:
+            InvalidInputError: the duration is not a positive number, or the damping is not in [0, 1).
+        """
+        if not 0 < duration < math.inf:
+            raise InvalidInputError(f"duration={duration} must be a positive number of seconds")
+        if not 0 <= damping < 1:
+            raise InvalidInputError(f"damping={damping} must be at least 0 and below 1")
+        down = GRAVITY * np.array([*np.sin(tilt), -np.cos(np.hypot(*tilt))])
+        with self._scope(), Progress("Simulating", len(batch), style=progress or "none") as shown:
+            state = _State(batch, self.device)
+            translation, rotation = state.translation.clone(), state.rotation.clone()
+            valid, plan = state.valid.clone(), _Plan(state, self._library)
+            steps, most = max(1, round(duration / TIMESTEP)), _SCENE_WORLDS[self.device.type]
+            open_rows = [slice(start, min(start + most, len(batch))) for start in range(0, len(batch), most)][::-1]
+            while open_rows:
+                rows = open_rows.pop()
+                moved = self._launch_scenes(plan, rows, steps, down, -math.log1p(-damping))
+                if moved is None and rows.stop - rows.start > 1:
+                    open_rows += _halves(rows)
+                    continue
+                if moved is None:
+                    valid[rows] = False
+                else:
+                    index = plan.free[rows]
+                    scene = torch.arange(len(batch), device=self.device)[rows, None].expand_as(index)
+                    chosen = (plan.category[rows, plan.fixed :] >= 0) & moved[2][:, None]
+                    translation[scene[chosen], index[chosen]] = moved[0][chosen]
+                    rotation[scene[chosen], index[chosen]] = moved[1][chosen]
+                    valid[rows] &= moved[2]
+                shown.update(rows.stop, "", f"simulated {rows.stop} of {len(batch)} scenes")
+            if lost := int((state.valid & ~valid).sum()):
+                _LOGGER.warning("%d of %d scenes are invalid: diverged, or more contacts than fit", lost, len(batch))
+        return translation.float(), rotation.float(), valid
+
+    def _launch_scenes(
+        self, plan: _Plan, rows: slice, steps: int, gravity: Array, damping: float
+    ) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Asset frames (w, S, 3), (w, S, 3, 3) of the free objects after some steps and validity (w,); None where the
+        contacts did not fit.
+        """
+        wp, library, most = self._wp, self._library, _SCENE_WORLDS[self.device.type]
+        category = plan.category[rows]
+        count, fixed = category.shape[0], plan.fixed
+        model = self._model(plan.key, lambda: _free_bodies(self._mujoco, *plan.key))
+        m, free = model.device, category[:, fixed:]
+        library.fill(wp, m, category[:, plan.column], plan.part, most)
+        library.fill_bodies(wp, m, free, most, damping)
+        wp.to_torch(m.opt.gravity)[:] = torch.tensor(gravity, dtype=torch.float32, device=self.device)
+        present, free = free >= 0, free.clamp(min=0)
+        turn = plan.rotation[rows, fixed:] @ library.axes[free]
+        center = plan.translation[rows, fixed:] + _turned(plan.rotation[rows, fixed:], library.center_of_mass[free])
+        start = torch.cat([center, matrix_to_quaternion(turn)], dim=-1)
+        column, part = plan.column[: plan.fixed_geometries], plan.part[: plan.fixed_geometries]
+        owner = plan.rotation[rows][:, column]
+        which = category[:, column].clamp(min=0)
+        placed = plan.translation[rows][:, column] + _turned(owner, library.position[which, part])
+        turned = owner @ library.rotation[which, part]
+        contacts, constraints, limit = 64, 256, _PART_PAIRS[self.device.type]
+        while True:
+            room = min(limit, count * contacts)
+            data = self._mjw.make_data(model.host, nworld=count, naconmax=room, njmax=constraints)
+            wp.to_torch(data.geom_xpos)[:, : len(column)] = placed.float()
+            wp.to_torch(data.geom_xmat)[:, : len(column)] = turned.float()
+            qpos = wp.to_torch(data.qpos).unflatten(1, (-1, 7))
+            qpos[present] = start[present].float()
+            with self._compiling("motion", m.nv):
+                peak, overflow = self._steps(m, data, steps)
+            crowded = (overflow & int(self._mjw.OverflowType.NEFC | self._mjw.OverflowType.NJMAX_NNZ)) != 0
+            if peak > room and room < limit:
+                contacts *= 2 ** max(1, math.ceil(math.log2(peak / room)))
+            elif peak > room:
+                return None
+            elif bool(crowded.any()) and constraints < _CONSTRAINTS:
+                constraints *= 2
+            else:
+                break
+        end = qpos.double()
+        turn = quaternion_to_matrix(end[..., 3:]) @ library.axes[free].transpose(-1, -2)
+        finite = end.isfinite().all(dim=-1).all(dim=-1) & ~crowded
+        return end[..., :3] - _turned(turn, library.center_of_mass[free]), turn, finite
+
+    def _steps(self, m: Any, data: Any, steps: int) -> tuple[int, Tensor]:
+        """Advance all worlds: the most part pairs or contacts of a step, and the union of overflow flags (w,)."""
+        wp, mjw = self._wp, self._mjw
+        counters = [wp.to_torch(counter) for counter in (data.ncollision, data.nacon)]
+        overflow = wp.to_torch(data.overflow)
+        peak, seen = torch.zeros_like(counters[0]), torch.zeros_like(overflow)
+        graph, state = None, [wp.to_torch(array) for array in (data.qpos, data.qvel, data.qacc_warmstart, data.time)]
+        if self._stream is not None and steps > 1:
+            before = [array.clone() for array in state]
+            mjw.step(m, data)  # loads the kernels, which a capture cannot do
+            for array, kept in zip(state, before, strict=True):
+                array.copy_(kept)
+            overflow.zero_()
+            with wp.ScopedCapture(stream=wp.stream_from_torch(self._stream)) as capture:
+                mjw.step(m, data)
+            graph = capture.graph
+        for _ in range(steps):
+            if graph is None:
+                mjw.step(m, data)
+            else:
+                wp.capture_launch(graph)
+            peak = torch.maximum(peak, torch.maximum(*counters))
+            seen |= overflow
+        return int(peak.max()), seen
 
     def _model(self, key: Any, build: Any) -> _Model:
         """A template model on the device, with the meshes of the library."""
@@ -276,6 +427,41 @@ class _State:
         self.welded = torch.isin(self.category, welded) & self.present
 
 
+class _Plan:
+    """Objects of a batch as columns of one model: the welded ones, then the free ones by number of parts and pose.
+
+    ``category`` (B, F + S) is -1 where a column is empty; ``translation`` and ``rotation`` (B, F + S, ...) are their
+    poses, and ``free`` (B, S) their slots. Geometry g is part ``part[g]`` of column ``column[g]``.
+    """
+
+    def __init__(self, state: _State, library: _Library) -> None:
+        device = state.pose.device
+        parts = library.parts[state.category]
+        kind = torch.where(state.present, torch.where(state.welded, 1, 0), 2)
+        keys = [*state.pose.unbind(dim=-1)[::-1], state.category, -parts, kind]
+        order = torch.arange(kind.shape[1], device=device).expand_as(kind)
+        for key in keys:
+            order = order.gather(1, key.gather(1, order).argsort(dim=1, stable=True))
+        frees, welds = (kind == 0).sum(dim=1), (kind == 1).sum(dim=1)
+        most_free, self.fixed = (int(counts.max()) if len(counts) else 0 for counts in (frees, welds))
+        bodies = next((size for size in _BODIES if size >= most_free), most_free)
+        columns = torch.arange(self.fixed + bodies, device=device)
+        is_free = columns >= self.fixed
+        place = torch.where(is_free, columns - self.fixed, columns + frees[:, None])
+        there = place < torch.where(is_free, frees[:, None], (frees + welds)[:, None])
+        slot = order.gather(1, place.clamp(max=kind.shape[1] - 1))
+        scene = torch.arange(len(kind), device=device)[:, None]
+        self.category = torch.where(there, state.category[scene, slot], -1)
+        self.translation, self.rotation = state.translation[scene, slot], state.rotation[scene, slot]
+        self.free = slot[:, self.fixed :]
+        most = torch.where(there, parts[scene, slot], 0).amax(dim=0) if len(kind) else columns
+        sizes = [int(size) for size in most.tolist()]
+        self.fixed_geometries = sum(sizes[: self.fixed])
+        self.key = (self.fixed_geometries, tuple(sizes[self.fixed :]))
+        self.column = columns.repeat_interleave(most)
+        self.part = torch.cat([torch.arange(size, device=device) for size in sizes] or [columns])
+
+
 class _Library:
     """Parts of all assets as meshes of MuJoCo, and tables (C, K, ...) of them, K the most parts of an asset."""
 
@@ -296,18 +482,27 @@ class _Library:
         for geom in range(host.ngeom):
             mujoco.mju_quat2Mat(rotation[geom], host.geom_quat[geom])
 
-        def table(values: Array, empty: float, dtype: torch.dtype) -> Tensor:
-            out = np.full((len(assets), max(counts), *values.shape[1:]), empty, dtype=np.float64)
+        def table(values: Array, empty: Any, dtype: torch.dtype) -> Tensor:
+            out = np.zeros((len(assets), max(counts), *values.shape[1:])) + empty
             for c, start in enumerate(np.cumsum(counts) - counts):
                 out[c, : counts[c]] = values[start : start + counts[c]]
             return torch.tensor(out, dtype=dtype, device=device)
 
         self.mesh = table(host.geom_dataid, -1, torch.int32)
         self.position = table(host.geom_pos, 0, torch.float64)
-        self.rotation = table(rotation.reshape(-1, 3, 3), 0, torch.float64)
+        self.rotation = table(rotation.reshape(-1, 3, 3), np.eye(3), torch.float64)
         self.size = table(host.geom_size, 1, torch.float32)
         self.rbound = table(host.geom_rbound, 1, torch.float32)
         self.aabb = table(host.geom_aabb.reshape(-1, 2, 3), 1, torch.float32)
+        axes = [principal_inertia(asset.inertia) for asset in assets]
+        self.moments = torch.tensor(np.stack([moments for moments, _ in axes]), device=device)
+        self.axes = torch.tensor(np.stack([turn for _, turn in axes]), device=device)  # (C, 3, 3), asset frame
+        self.center_of_mass = torch.tensor(np.stack([asset.center_of_mass for asset in assets]), device=device)
+        self.mass = torch.tensor([asset.mass for asset in assets], dtype=torch.float64, device=device)
+        inverse = self.axes.transpose(1, 2)[:, None]  # the frame of a free body is that of its inertia
+        self.inner_position = _turned(inverse, self.position - self.center_of_mass[:, None]).float()
+        self.inner_quaternion = matrix_to_quaternion(inverse @ self.rotation).float()
+        self.parts = torch.tensor(counts, device=device)
         bounds = torch.tensor(np.stack([asset.bounds for asset in assets]), device=device)
         self.center, self.half = bounds.mean(dim=1), (bounds[:, 1] - bounds[:, 0]) / 2 + 1e-6
 
@@ -317,17 +512,62 @@ class _Library:
         for name in (*names, "npolygonmax", "nmeshdegmax"):
             setattr(model, name, getattr(self._meshes, name))
 
-    def fill(self, wp: Any, model: _Model, mesh: Tensor, categories: Tensor) -> None:
-        """Set the geometries of the model per world: meshes (W, G), -1 for none, of objects (w, S) of categories."""
+    def fill_bodies(self, wp: Any, model: Any, category: Tensor, rows: int, damping: float) -> None:
+        """Set masses of free bodies of category (w, S), or -1, in ``rows`` worlds; the frame of a body is its inertia's.
 
-        def rows(table: Tensor) -> Tensor:
-            return _padded(table[categories].flatten(1, 2), len(mesh), 1.0)
+        ``damping`` is the rate (1/s) at which velocities decay.
+        """
+        missing, category = category < 0, category.clamp(min=0)
+        mass = self.mass[category].masked_fill(missing, 1.0)
+        moments = self.moments[category].masked_fill(missing[..., None], 1.0)
+        inverse = torch.stack([1 / mass, (1 / moments).mean(dim=-1)], dim=-1)
+        dofs = torch.cat([mass[..., None].expand_as(moments), moments], dim=-1).flatten(1)
 
-        m = model.device
-        m.geom_dataid = wp.from_torch(mesh, dtype=wp.int32)
-        m.geom_size = wp.from_torch(rows(self.size), dtype=wp.vec3)
-        m.geom_rbound = wp.from_torch(rows(self.rbound), dtype=wp.float32)
-        m.geom_aabb = wp.from_torch(rows(self.aabb), dtype=wp.vec3)
+        def put(name: str, values: Tensor, dtype: Any, world: float | None = None) -> None:
+            if world is not None:  # the world is body 0
+                values = torch.cat([torch.full_like(values[:, :1], world), values], dim=1)
+            setattr(model, name, wp.from_torch(_padded(values.float(), rows, 1.0), dtype=dtype))
+
+        put("body_mass", mass, wp.float32, 0.0)
+        put("body_inertia", moments, wp.vec3, 0.0)
+        put("body_invweight0", inverse, wp.vec2, 0.0)
+        put("body_subtreemass", mass, wp.float32, 0.0)
+        wp.to_torch(model.body_subtreemass)[: len(mass), 0] = mass.sum(dim=1).float()
+        put("dof_invweight0", inverse.repeat_interleave(3, dim=-1).flatten(1), wp.float32)
+        put("dof_damping", damping * dofs, wp.float32)
+
+    def fill(self, wp: Any, model: Any, category: Tensor, part: Tensor, rows: int) -> None:
+        """Set geometries of a model: part number (G,) of an asset of category (w, G), or -1, in ``rows`` >= w worlds."""
+
+        def take(table: Tensor, empty: float) -> Tensor:
+            chosen = table[category.clamp(min=0), part]
+            missing = (category < 0).reshape(*category.shape, *[1] * (chosen.ndim - 2))
+            return _padded(chosen.masked_fill(missing, empty), rows, empty)
+
+        model.geom_dataid = wp.from_torch(take(self.mesh, -1), dtype=wp.int32)
+        model.geom_size = wp.from_torch(take(self.size, 1), dtype=wp.vec3)
+        model.geom_rbound = wp.from_torch(take(self.rbound, 1), dtype=wp.float32)
+        model.geom_aabb = wp.from_torch(take(self.aabb, 1), dtype=wp.vec3)
+        model.geom_pos = wp.from_torch(take(self.inner_position, 0), dtype=wp.vec3)
+        model.geom_quat = wp.from_torch(take(self.inner_quaternion, 0.5), dtype=wp.quat)
+
+
+def _free_bodies(mujoco: Any, fixed: int, parts: tuple[int, ...]) -> Any:
+    """``fixed`` mesh geometries of the world, and free bodies of ``parts`` each."""
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep, option.impratio = TIMESTEP, 10.0
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    _add_tetrahedron(mujoco, spec)
+    bodies = [spec.worldbody.add_body(mass=1.0, inertia=[1.0, 1.0, 1.0]) for _ in parts]
+    for body in bodies:
+        body.add_freejoint()
+    for parent, count in ((spec.worldbody, fixed), *zip(bodies, parts, strict=True)):
+        for _ in range(count):
+            geom = parent.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="any", mass=0.0)
+            geom.friction, geom.solref, geom.solimp = [FRICTION, 0.005, 0.0001], _SOLREF, _SOLIMP
+    return spec.compile()
 
 
 def _two_bodies(mujoco: Any, parts: int) -> Any:
@@ -345,6 +585,12 @@ def _two_bodies(mujoco: Any, parts: int) -> Any:
 
 def _add_tetrahedron(mujoco: Any, spec: Any) -> None:
     spec.add_mesh(name="any", uservert=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+
+
+def _halves(rows: slice) -> list[slice]:
+    """The two halves of a range, the first one last."""
+    middle = (rows.start + rows.stop) // 2
+    return [slice(middle, rows.stop), slice(rows.start, middle)]
 
 
 def _padded(rows: Tensor, count: int, value: float) -> Tensor:
