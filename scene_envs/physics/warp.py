@@ -32,7 +32,7 @@ from scene_envs.scene_types import SceneType
 _LOGGER = logging.getLogger(__name__)
 _PAIR_CELLS = 1 << 26
 """Object pairs whose boxes are compared at a time."""
-_PART_PAIRS = {"cuda": 1 << 18, "cpu": 1 << 15}
+_PART_PAIRS = {"cuda": 1 << 19, "cpu": 1 << 15}
 """Most pairs of parts whose depths are computed at a time (6 kB each); a single object pair may not have more."""
 _PAIR_WORLDS = {"cuda": 1 << 14, "cpu": 1 << 10}
 """Most object pairs of a launch, and rows of the arrays per world: kernels depend on the number of rows."""
@@ -40,6 +40,10 @@ _SCENE_WORLDS = {"cuda": 1024, "cpu": 32}
 """Most scenes of a launch."""
 _BODIES = (4, 8, 16, 24, 32, 48, 64, 96, 128)
 """Numbers of free bodies of a model; kernels depend on it."""
+_CONTACTS = 384
+"""Room for contacts per scene at first, and pairs of near parts."""
+_CHECK = 10
+"""Steps between looks at the counters."""
 _CONSTRAINTS = 1 << 13
 """Most rows of constraints of a scene, three per contact."""
 TIMESTEP = 0.002
@@ -313,21 +317,22 @@ class WarpEngine:
         which = category[:, column].clamp(min=0)
         placed = plan.translation[rows][:, column] + _turned(owner, library.position[which, part])
         turned = owner @ library.rotation[which, part]
-        contacts, constraints, limit = 64, 256, _PART_PAIRS[self.device.type]
+        limit = _PART_PAIRS[self.device.type]
+        contacts, constraints = min(limit, count * _CONTACTS), 3 * _CONTACTS
         while True:
-            room = min(limit, count * contacts)
-            data = self._mjw.make_data(model.host, nworld=count, naconmax=room, njmax=constraints)
+            data = self._mjw.make_data(
+                model.host, nworld=count, naconmax=contacts, njmax=constraints, njmax_nnz=12 * constraints
+            )
             wp.to_torch(data.geom_xpos)[:, : len(column)] = placed.float()
             wp.to_torch(data.geom_xmat)[:, : len(column)] = turned.float()
             qpos = wp.to_torch(data.qpos).unflatten(1, (-1, 7))
             qpos[present] = start[present].float()
             with self._compiling("motion", m.nv):
-                peak, overflow = self._steps(m, data, steps)
-            crowded = (overflow & int(self._mjw.OverflowType.NEFC | self._mjw.OverflowType.NJMAX_NNZ)) != 0
-            if peak > room and room < limit:
-                contacts *= 2 ** max(1, math.ceil(math.log2(peak / room)))
-            elif peak > room:
-                return None
+                peak, crowded = self._steps(m, data, steps, contacts, constraints < _CONSTRAINTS)
+            if peak > contacts:
+                if contacts == limit:
+                    return None
+                contacts = min(limit, 2 * peak)
             elif bool(crowded.any()) and constraints < _CONSTRAINTS:
                 constraints *= 2
             else:
@@ -337,11 +342,13 @@ class WarpEngine:
         finite = end.isfinite().all(dim=-1).all(dim=-1) & ~crowded
         return end[..., :3] - _turned(turn, library.center_of_mass[free]), turn, finite
 
-    def _steps(self, m: Any, data: Any, steps: int) -> tuple[int, Tensor]:
-        """Advance all worlds: the most part pairs or contacts of a step, and the union of overflow flags (w,)."""
+    def _steps(self, m: Any, data: Any, steps: int, contacts: int, stop: bool) -> tuple[int, Tensor]:
+        """Advance all worlds: the most part pairs or contacts of a step, and worlds (w,) of too many constraints. Ends
+        early where there are more than ``contacts``, or, if ``stop``, too many constraints.
+        """
         wp, mjw = self._wp, self._mjw
         counters = [wp.to_torch(counter) for counter in (data.ncollision, data.nacon)]
-        overflow = wp.to_torch(data.overflow)
+        overflow, flags = wp.to_torch(data.overflow), int(mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ)
         peak, seen = torch.zeros_like(counters[0]), torch.zeros_like(overflow)
         graph, state = None, [wp.to_torch(array) for array in (data.qpos, data.qvel, data.qacc_warmstart, data.time)]
         if self._stream is not None and steps > 1:
@@ -353,14 +360,16 @@ class WarpEngine:
             with wp.ScopedCapture(stream=wp.stream_from_torch(self._stream)) as capture:
                 mjw.step(m, data)
             graph = capture.graph
-        for _ in range(steps):
+        for index in range(steps):
             if graph is None:
                 mjw.step(m, data)
             else:
                 wp.capture_launch(graph)
             peak = torch.maximum(peak, torch.maximum(*counters))
             seen |= overflow
-        return int(peak.max()), seen
+            if index % _CHECK == 0 and (int(peak) > contacts or stop and bool((seen & flags).any())):
+                break
+        return int(peak), (seen & flags) != 0
 
     def _model(self, key: Any, build: Any) -> _Model:
         """A template model on the device, with the meshes of the library."""
