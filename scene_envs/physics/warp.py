@@ -10,10 +10,10 @@ from __future__ import annotations
 import logging
 import math
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,8 @@ _BODIES = (4, 8, 16, 24, 32, 48, 64, 96, 128)
 """Numbers of free bodies of a model; kernels depend on it."""
 _CONTACTS = 384
 """Room for contacts per scene at first, and pairs of near parts."""
+_MODELS = 8
+"""Models kept at a time."""
 _CHECK = 10
 """Steps between looks at the counters."""
 _CONSTRAINTS = 1 << 13
@@ -65,7 +67,7 @@ class Overlaps:
         second: (P,) int64, slot of the other, a greater number.
         depth: (P,) m, deepest overlap of any two fine convex parts of the two objects.
         normal: (P, 3) unit vector, world frame, along which the second object leaves that overlap.
-        valid: (B,) bool; False where a pose is not finite or a pair has too many pairs of parts. No pair is listed there.
+        valid: (B,) bool; False where a pose is not finite, or one pair has too many pairs of parts. No pair is listed.
     """
 
     scene: Tensor
@@ -77,7 +79,7 @@ class Overlaps:
 
 
 @cache
-def warp_engine(scene_type: SceneType, device: str = "cuda") -> WarpEngine:
+def warp_engine(scene_type: SceneType, device: str | torch.device = "cuda") -> WarpEngine:
     """The engine of a scene type on a device, made on first use and kept by this process; see :class:`WarpEngine`."""
     return WarpEngine(scene_type, device)
 
@@ -97,13 +99,16 @@ class WarpEngine:
     """
 
     def __init__(self, scene_type: SceneType, device: str | torch.device = "cuda") -> None:
-        self.scene_type, self.device = scene_type, torch.device(device)
-        if self.device.type == "cuda" and not torch.cuda.is_available():
+        device = torch.device(device)
+        if device.type == "cuda" and not torch.cuda.is_available():
             raise InvalidInputError(f"device {str(device)!r} was asked for, but torch finds no CUDA GPU; use 'cpu'")
         self._mujoco, self._mjw, self._wp = _modules()
-        self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
-        self._library = _Library(self._mujoco, self._mjw, scene_type, self.device, self._scope)
-        self._models: dict[Any, Any] = {}
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        self.scene_type = scene_type
+        self.device = device if self._stream is None else self._stream.device
+        with self._scope():
+            self._library = _Library(self._mujoco, self._mjw, scene_type, self.device)
+        self._models: dict[Any, tuple[Any, Any]] = {}
 
     @contextmanager
     def _scope(self) -> Iterator[None]:
@@ -127,10 +132,8 @@ class WarpEngine:
     def _overlaps(self, batch: SceneBatch) -> Overlaps:
         state = _State(batch, self.device)
         scene, one, two = self._near(state)
-        category = state.category[scene, one], state.category[scene, two]
         feature = [
-            torch.cat([c.double()[:, None], state.pose[scene, slot]], dim=1)
-            for c, slot in zip(category, (one, two), strict=True)
+            torch.cat([state.category[scene, slot, None], state.pose[scene, slot]], dim=1) for slot in (one, two)
         ]
         apart = feature[0] - feature[1]  # the order within a pair is by category and pose, not by slot
         row = (apart != 0).long().argmax(dim=1, keepdim=True)
@@ -142,10 +145,8 @@ class WarpEngine:
         valid = state.valid.clone()
         valid[scene[lost]] = False
         if missing := int((~valid).sum()):
-            _LOGGER.warning(
-                "%d of %d scenes are invalid: poses that are not finite, or an object pair of more than %d near part pairs",
-                missing, len(batch), _PART_PAIRS[self.device.type],
-            )  # fmt: skip
+            _LOGGER.warning("%d of %d scenes are invalid: a pose is not finite, or one pair of objects has more than "
+                            "%d near pairs of parts", missing, len(batch), _PART_PAIRS[self.device.type])  # fmt: skip
         kept = (depth > 0) & valid[scene]
         return Overlaps(scene[kept], one[kept], two[kept], depth[kept], normal[kept].float(), valid)
 
@@ -179,17 +180,15 @@ class WarpEngine:
         depth = torch.zeros(len(scene), dtype=torch.float64, device=self.device)
         normal = torch.zeros(len(scene), 3, dtype=torch.float64, device=self.device)
         lost = torch.zeros(len(scene), dtype=torch.bool, device=self.device)
-        most = _PAIR_WORLDS[self.device.type]
-        open_rows = [slice(start, min(start + most, len(scene))) for start in range(0, len(scene), most)][::-1]
-        while open_rows:
-            rows = open_rows.pop()
-            found = self._launch_pairs(first[rows], second[rows], relative[rows], moved[rows])
-            if found is not None:
-                depth[rows], normal[rows] = found
-            elif rows.stop - rows.start == 1:
+
+        def launch(rows: slice) -> tuple[Tensor, Tensor] | None:
+            return self._launch_pairs(first[rows], second[rows], relative[rows], moved[rows])
+
+        for rows, found in _launches(len(scene), _PAIR_WORLDS[self.device.type], launch):
+            if found is None:
                 lost[rows] = True
             else:
-                open_rows += _halves(rows)
+                depth[rows], normal[rows] = found
         return depth, _turned(turn, normal), lost
 
     def _launch_pairs(
@@ -199,11 +198,11 @@ class WarpEngine:
         library, wp = self._library, self._wp
         count, parts = len(first), library.mesh.shape[1]
         worlds, most = 1 << (count - 1).bit_length(), _PAIR_WORLDS[self.device.type]
-        model = self._model("pairs", lambda: _two_bodies(self._mujoco, parts))
+        host, model = self._model(parts, (parts,), multiple=False)
         with self._compiling("overlaps"):
             categories = torch.stack([first, second], dim=1)
             part = torch.arange(parts, device=self.device).repeat(2)
-            library.fill(wp, model.device, categories.repeat_interleave(parts, dim=1), part, most)
+            library.fill(wp, model, categories.repeat_interleave(parts, dim=1), part, most)
             aside = torch.tensor(_ASIDE, dtype=torch.float64, device=self.device)
             position, turn = library.position[categories], library.rotation[categories]  # (P, 2, K, ...)
             other = _turned(rotation[:, None], position[:, 1]) + translation[:, None] + aside
@@ -211,10 +210,10 @@ class WarpEngine:
             turned = torch.stack([turn[:, 0], rotation[:, None] @ turn[:, 1]], 1)
             limit = 16 * worlds
             while True:
-                data = self._mjw.make_data(model.host, nworld=worlds, naconmax=limit, njmax=1)
+                data = self._mjw.make_data(host, nworld=worlds, naconmax=limit, njmax=1)
                 wp.to_torch(data.geom_xpos)[:count] = placed.flatten(1, 2).float()
                 wp.to_torch(data.geom_xmat)[:count] = turned.flatten(1, 2).float()
-                self._mjw.collision(model.device, data)
+                self._mjw.collision(model, data)
                 needed = max(int(wp.to_torch(data.ncollision)), int(wp.to_torch(data.nacon)))
                 if needed <= limit:
                     break
@@ -226,9 +225,7 @@ class WarpEngine:
         away = wp.to_torch(data.contact.frame)[contacts, 0].double()
         deep = away @ aside - wp.to_torch(data.contact.dist)[contacts].double()
         pair = wp.to_torch(data.contact.geom)[contacts].long()
-        number = (
-            pair[:, 0] * 2 * parts + pair[:, 1]
-        )  # of equal depths, that of the first pair of parts gives the normal
+        number = pair[:, 0] * 2 * parts + pair[:, 1]  # of equal depths, the first pair of parts gives the normal
         depth = torch.zeros(worlds, dtype=torch.float64, device=self.device).scatter_reduce(0, world, deep, "amax")
         best = deep == depth[world]
         chosen = torch.full((worlds,), 4 * parts * parts, device=self.device)
@@ -257,8 +254,8 @@ class WarpEngine:
             progress: Style of progress, one of :data:`scene_envs.progress.STYLES`; None shows none.
 
         Returns:
-            Translations (B, N, 3) m and rotations (B, N, 3, 3) float32 at the end, and validity (B,) bool: False where a
-            pose is not finite, the simulation diverged, or there were more contacts than fit. Poses are unchanged there.
+            Translations (B, N, 3) m and rotations (B, N, 3, 3) float32 at the end, and validity (B,) bool: False, and
+            poses unchanged, where a pose is not finite, the simulation diverged, or more contacts arose than fit.
 
         Raises:
             InvalidInputError: the duration is not a positive number, or the damping is not in [0, 1).
@@ -272,30 +269,26 @@ class WarpEngine:
             state = _State(batch, self.device)
             translation, rotation = state.translation.clone(), state.rotation.clone()
             valid, plan = state.valid.clone(), _Plan(state, self._library)
-            steps, most = max(1, round(duration / TIMESTEP)), _SCENE_WORLDS[self.device.type]
-            open_rows = [slice(start, min(start + most, len(batch))) for start in range(0, len(batch), most)][::-1]
-            while open_rows:
-                rows = open_rows.pop()
-                moved = self._launch_scenes(plan, rows, steps, down, -math.log1p(-damping))
-                if moved is None and rows.stop - rows.start > 1:
-                    open_rows += _halves(rows)
-                    continue
+            steps = max(1, round(duration / TIMESTEP))
+
+            def launch(rows: slice) -> tuple[Tensor, Tensor, Tensor] | None:
+                return self._launch_scenes(plan, rows, steps, down, -math.log1p(-damping), shown)
+
+            for rows, moved in _launches(len(batch), _SCENE_WORLDS[self.device.type], launch):
+                shown.update(rows.stop, "", f"simulated {rows.stop} of {len(batch)} scenes")
                 if moved is None:
                     valid[rows] = False
-                else:
-                    index = plan.free[rows]
-                    scene = torch.arange(len(batch), device=self.device)[rows, None].expand_as(index)
-                    chosen = (plan.category[rows, plan.fixed :] >= 0) & moved[2][:, None]
-                    translation[scene[chosen], index[chosen]] = moved[0][chosen]
-                    rotation[scene[chosen], index[chosen]] = moved[1][chosen]
-                    valid[rows] &= moved[2]
-                shown.update(rows.stop, "", f"simulated {rows.stop} of {len(batch)} scenes")
+                    continue
+                valid[rows] &= moved[2]
+                row, column = ((plan.category[rows, plan.fixed :] >= 0) & valid[rows, None]).nonzero().unbind(dim=1)
+                scene, slot = row + rows.start, plan.free[rows][row, column]
+                translation[scene, slot], rotation[scene, slot] = moved[0][row, column], moved[1][row, column]
             if lost := int((state.valid & ~valid).sum()):
                 _LOGGER.warning("%d of %d scenes are invalid: diverged, or more contacts than fit", lost, len(batch))
         return translation.float(), rotation.float(), valid
 
     def _launch_scenes(
-        self, plan: _Plan, rows: slice, steps: int, gravity: Array, damping: float
+        self, plan: _Plan, rows: slice, steps: int, gravity: Array, damping: float, shown: Progress
     ) -> tuple[Tensor, Tensor, Tensor] | None:
         """Asset frames (w, S, 3), (w, S, 3, 3) of the free objects after some steps and validity (w,); None where the
         contacts did not fit.
@@ -303,8 +296,8 @@ class WarpEngine:
         wp, library, most = self._wp, self._library, _SCENE_WORLDS[self.device.type]
         category = plan.category[rows]
         count, fixed = category.shape[0], plan.fixed
-        model = self._model(plan.key, lambda: _free_bodies(self._mujoco, *plan.key))
-        m, free = model.device, category[:, fixed:]
+        host, m = self._model(*plan.sizes, multiple=True)
+        free = category[:, fixed:]
         library.fill(wp, m, category[:, plan.column], plan.part, most)
         library.fill_bodies(wp, m, free, most, damping)
         wp.to_torch(m.opt.gravity)[:] = torch.tensor(gravity, dtype=torch.float32, device=self.device)
@@ -321,13 +314,13 @@ class WarpEngine:
         contacts, constraints = min(limit, count * _CONTACTS), 3 * _CONTACTS
         while True:
             data = self._mjw.make_data(
-                model.host, nworld=count, naconmax=contacts, njmax=constraints, njmax_nnz=12 * constraints
+                host, nworld=count, naconmax=contacts, njmax=constraints, njmax_nnz=12 * constraints
             )
             wp.to_torch(data.geom_xpos)[:, : len(column)] = placed.float()
             wp.to_torch(data.geom_xmat)[:, : len(column)] = turned.float()
             qpos = wp.to_torch(data.qpos).unflatten(1, (-1, 7))
             qpos[present] = start[present].float()
-            with self._compiling("motion", m.nv):
+            with self._compiling("motion", m.nv, shown=shown):
                 peak, crowded = self._steps(m, data, steps, contacts, constraints < _CONSTRAINTS)
             if peak > contacts:
                 if contacts == limit:
@@ -367,39 +360,35 @@ class WarpEngine:
                 wp.capture_launch(graph)
             peak = torch.maximum(peak, torch.maximum(*counters))
             seen |= overflow
-            if index % _CHECK == 0 and (int(peak) > contacts or stop and bool((seen & flags).any())):
+            if index % _CHECK == 0 and (int(peak) > contacts or (stop and bool((seen & flags).any()))):
                 break
         return int(peak), (seen & flags) != 0
 
-    def _model(self, key: Any, build: Any) -> _Model:
-        """A template model on the device, with the meshes of the library."""
+    def _model(self, fixed: int, parts: tuple[int, ...], *, multiple: bool) -> tuple[Any, Any]:
+        """A model on the host and on the device with the meshes of the library; see :func:`_template`."""
+        key = fixed, parts, multiple
         if key not in self._models:
-            host = build()
+            if len(self._models) >= _MODELS:
+                self._models.clear()
+            host = _template(self._mujoco, fixed, parts, multiple=multiple)
             model = self._mjw.put_model(host)
             self._library.lend_meshes(model)
             model.opt.warn_overflow = 0
-            self._models[key] = _Model(host, model)
+            self._models[key] = host, model
         return self._models[key]
 
     @contextmanager
-    def _compiling(self, what: str, *sizes: int, progress: str | None = None) -> Iterator[None]:
+    def _compiling(self, *what: str | int, shown: Progress | None = None) -> Iterator[None]:
         """Say once per machine that kernels are compiled now."""
         folder = Path(self._wp.config.kernel_cache_dir or ".")
-        name = "-".join(map(str, ("scene_envs", self.device.type, what, *sizes)))
-        if (folder / name).exists():
-            yield
-            return
-        _LOGGER.info("MuJoCo Warp compiles its kernels for %s, once, about a minute; they are kept in %s", what, folder)
-        with Progress(f"Compiling kernels for {what}", 1, style=progress or "none") as shown:
-            yield
-            shown.update(1, "", "kernels compiled")
-        (folder / name).touch()
-
-
-@dataclass(frozen=True)
-class _Model:
-    host: Any  # mujoco.MjModel
-    device: Any  # mujoco_warp.Model
+        mark = folder / "-".join(map(str, ("scene_envs", self._mjw.__version__, self.device.type, *what)))
+        if not mark.exists():
+            text = "MuJoCo Warp compiles its kernels, once, about a minute"
+            _LOGGER.info("%s; they are kept in %s", text, folder)
+            if shown:
+                shown.update(0, text, text)
+        yield
+        mark.touch()
 
 
 @cache
@@ -412,7 +401,8 @@ def _modules() -> tuple[Any, Any, Any]:
     except ImportError as error:
         python = f"{sys.version_info.major}.{sys.version_info.minor}"
         raise MissingDependencyError(
-            f'physics on a GPU needs mujoco-warp, which is not installed for Python {python}: pip install "scene-envs[gpu]"'
+            f"physics on a GPU needs mujoco-warp, which is not installed for Python {python}; "
+            'install it with: pip install "scene-envs[gpu]"'
         ) from error
     warp.config.log_level = warp.LOG_ERROR
     warp.init()
@@ -466,7 +456,7 @@ class _Plan:
         most = torch.where(there, parts[scene, slot], 0).amax(dim=0) if len(kind) else columns
         sizes = [int(size) for size in most.tolist()]
         self.fixed_geometries = sum(sizes[: self.fixed])
-        self.key = (self.fixed_geometries, tuple(sizes[self.fixed :]))
+        self.sizes = self.fixed_geometries, tuple(sizes[self.fixed :])
         self.column = columns.repeat_interleave(most)
         self.part = torch.cat([torch.arange(size, device=device) for size in sizes] or [columns])
 
@@ -474,7 +464,7 @@ class _Plan:
 class _Library:
     """Parts of all assets as meshes of MuJoCo, and tables (C, K, ...) of them, K the most parts of an asset."""
 
-    def __init__(self, mujoco: Any, mjw: Any, scene_type: SceneType, device: torch.device, scope: Any) -> None:
+    def __init__(self, mujoco: Any, mjw: Any, scene_type: SceneType, device: torch.device) -> None:
         assets = tuple(scene_type.library)
         spec = mujoco.MjSpec()
         for c, asset in enumerate(assets):
@@ -484,8 +474,7 @@ class _Library:
                 mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
                 spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
         host = spec.compile()
-        with scope():
-            self._meshes = mjw.put_model(host)
+        self._meshes = mjw.put_model(host)
         counts = [len(asset.fine) for asset in assets]
         rotation = np.zeros((host.ngeom, 9))
         for geom in range(host.ngeom):
@@ -522,7 +511,7 @@ class _Library:
             setattr(model, name, getattr(self._meshes, name))
 
     def fill_bodies(self, wp: Any, model: Any, category: Tensor, rows: int, damping: float) -> None:
-        """Set masses of free bodies of category (w, S), or -1, in ``rows`` worlds; the frame of a body is its inertia's.
+        """Set masses of free bodies of category (w, S), or -1, in ``rows`` worlds; a body's frame is its inertia's.
 
         ``damping`` is the rate (1/s) at which velocities decay.
         """
@@ -546,7 +535,7 @@ class _Library:
         put("dof_damping", damping * dofs, wp.float32)
 
     def fill(self, wp: Any, model: Any, category: Tensor, part: Tensor, rows: int) -> None:
-        """Set geometries of a model: part number (G,) of an asset of category (w, G), or -1, in ``rows`` >= w worlds."""
+        """Set geometries of a model in ``rows`` >= w worlds: part number (G,) of assets of category (w, G), or -1."""
 
         def take(table: Tensor, empty: float) -> Tensor:
             chosen = table[category.clamp(min=0), part]
@@ -561,14 +550,16 @@ class _Library:
         model.geom_quat = wp.from_torch(take(self.inner_quaternion, 0.5), dtype=wp.quat)
 
 
-def _free_bodies(mujoco: Any, fixed: int, parts: tuple[int, ...]) -> Any:
-    """``fixed`` mesh geometries of the world, and free bodies of ``parts`` each."""
+def _template(mujoco: Any, fixed: int, parts: tuple[int, ...], *, multiple: bool) -> Any:
+    """Model of ``fixed`` mesh geometries of the world, and free bodies of ``parts`` each; ``multiple`` is several
+    contacts per pair of geometries.
+    """
     spec = mujoco.MjSpec()
-    option = spec.option
-    option.timestep, option.impratio = TIMESTEP, 10.0
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    _add_tetrahedron(mujoco, spec)
+    spec.option.timestep, spec.option.impratio = TIMESTEP, 10.0
+    spec.option.cone, spec.option.integrator = mujoco.mjtCone.mjCONE_ELLIPTIC, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    if not multiple:
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
+    spec.add_mesh(name="any", uservert=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
     bodies = [spec.worldbody.add_body(mass=1.0, inertia=[1.0, 1.0, 1.0]) for _ in parts]
     for body in bodies:
         body.add_freejoint()
@@ -579,27 +570,17 @@ def _free_bodies(mujoco: Any, fixed: int, parts: tuple[int, ...]) -> Any:
     return spec.compile()
 
 
-def _two_bodies(mujoco: Any, parts: int) -> Any:
-    """A fixed and a free body of ``parts`` mesh geometries each."""
-    spec = mujoco.MjSpec()
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
-    _add_tetrahedron(mujoco, spec)
-    body = spec.worldbody.add_body(mass=1.0, inertia=[1.0, 1.0, 1.0])
-    body.add_freejoint()
-    for parent in (spec.worldbody, body):
-        for _ in range(parts):
-            parent.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="any", mass=0.0)
-    return spec.compile()
-
-
-def _add_tetrahedron(mujoco: Any, spec: Any) -> None:
-    spec.add_mesh(name="any", uservert=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
-
-
-def _halves(rows: slice) -> list[slice]:
-    """The two halves of a range, the first one last."""
-    middle = (rows.start + rows.stop) // 2
-    return [slice(middle, rows.stop), slice(rows.start, middle)]
+def _launches(count: int, most: int, launch: Callable[[slice], Any]) -> Iterator[tuple[slice, Any]]:
+    """Rows and result of launches of at most ``most`` rows, halved where it is None; None where one row is too many."""
+    open_rows = [slice(start, min(start + most, count)) for start in range(0, count, most)][::-1]
+    while open_rows:
+        rows = open_rows.pop()
+        result = launch(rows)
+        if result is None and rows.stop - rows.start > 1:
+            middle = (rows.start + rows.stop) // 2
+            open_rows += [slice(middle, rows.stop), slice(rows.start, middle)]
+        else:
+            yield rows, result
 
 
 def _padded(rows: Tensor, count: int, value: float) -> Tensor:
