@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cache
@@ -40,21 +40,20 @@ _SCENE_WORLDS = {"cuda": 1024, "cpu": 32}
 """Most scenes of a launch."""
 _BODIES = (4, 8, 16, 24, 32, 48, 64, 96, 128)
 """Numbers of free bodies of a model; kernels depend on it."""
-_CONTACTS = 384
-"""Room for contacts per scene at first, and pairs of near parts."""
+_ROOM, _MOST_ROOM = 384, 384 * 64
+"""Contacts of a scene for which there is room at first, and at most: a scene with more is simulated again."""
 _MODELS = 8
 """Models kept at a time."""
 _CHECK = 10
 """Steps between looks at the counters."""
-_CONSTRAINTS = 1 << 13
-"""Most rows of constraints of a scene, three per contact."""
 TIMESTEP = 0.002
 """Time step (s) of motion; this and the next two are those of exported MJCF."""
 _SOLREF, _SOLIMP = [0.004, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
 """Stiffness of contacts."""
 _ASIDE = (4.8e-7, 6.0e-7, 6.4e-7)
-"""The second object of a pair is moved by this (m) and its depths are corrected by it: parts that lie on one axis or
-have one centre are missed otherwise."""
+_ASKEW = ((1.0, -1.8e-6, -1.9e-6), (1.8e-6, 1.0, -1.4e-6), (1.9e-6, 1.4e-6, 1.0))
+"""The second object of a pair is moved by the first (m), by which depths are corrected, and its parts are turned by the
+second (3e-6 rad): the search for the depth misses parts with one centre and parallel faces."""
 
 
 @dataclass(frozen=True)
@@ -133,9 +132,10 @@ class WarpEngine:
         state = _State(batch, self.device)
         scene, one, two = self._near(state)
         feature = [
-            torch.cat([state.category[scene, slot, None], state.pose[scene, slot]], dim=1) for slot in (one, two)
+            torch.cat([~state.welded[scene, slot, None], state.category[scene, slot, None], state.pose[scene, slot]], 1)
+            for slot in (one, two)
         ]
-        apart = feature[0] - feature[1]  # the order within a pair is by category and pose, not by slot
+        apart = feature[0] - feature[1]  # welded first, then by category and pose: no matter which slots
         row = (apart != 0).long().argmax(dim=1, keepdim=True)
         swap = apart.gather(1, row).squeeze(1) > 0
         one, two = torch.where(swap, two, one), torch.where(swap, one, two)
@@ -180,15 +180,16 @@ class WarpEngine:
         depth = torch.zeros(len(scene), dtype=torch.float64, device=self.device)
         normal = torch.zeros(len(scene), 3, dtype=torch.float64, device=self.device)
         lost = torch.zeros(len(scene), dtype=torch.bool, device=self.device)
-
-        def launch(rows: slice) -> tuple[Tensor, Tensor] | None:
-            return self._launch_pairs(first[rows], second[rows], relative[rows], moved[rows])
-
-        for rows, found in _launches(len(scene), _PAIR_WORLDS[self.device.type], launch):
-            if found is None:
-                lost[rows] = True
-            else:
+        open_rows = _chunks(len(scene), _PAIR_WORLDS[self.device.type], self.device)
+        while open_rows:
+            rows = open_rows.pop()
+            found = self._launch_pairs(first[rows], second[rows], relative[rows], moved[rows])
+            if found is not None:
                 depth[rows], normal[rows] = found
+            elif len(rows) > 1:
+                open_rows += rows.chunk(2)[::-1]
+            else:
+                lost[rows] = True
         return depth, _turned(turn, normal), lost
 
     def _launch_pairs(
@@ -207,7 +208,8 @@ class WarpEngine:
             position, turn = library.position[categories], library.rotation[categories]  # (P, 2, K, ...)
             other = _turned(rotation[:, None], position[:, 1]) + translation[:, None] + aside
             placed = torch.stack([position[:, 0], other], 1)
-            turned = torch.stack([turn[:, 0], rotation[:, None] @ turn[:, 1]], 1)
+            askew = torch.tensor(_ASKEW, dtype=torch.float64, device=self.device)
+            turned = torch.stack([turn[:, 0], askew @ rotation[:, None] @ turn[:, 1]], 1)
             limit = 16 * worlds
             while True:
                 data = self._mjw.make_data(host, nworld=worlds, naconmax=limit, njmax=1)
@@ -270,28 +272,35 @@ class WarpEngine:
             translation, rotation = state.translation.clone(), state.rotation.clone()
             valid, plan = state.valid.clone(), _Plan(state, self._library)
             steps = max(1, round(duration / TIMESTEP))
-
-            def launch(rows: slice) -> tuple[Tensor, Tensor, Tensor] | None:
-                return self._launch_scenes(plan, rows, steps, down, -math.log1p(-damping), shown)
-
-            for rows, moved in _launches(len(batch), _SCENE_WORLDS[self.device.type], launch):
-                shown.update(rows.stop, "", f"simulated {rows.stop} of {len(batch)} scenes")
-                if moved is None:
-                    valid[rows] = False
+            open_rows = [(rows, _ROOM) for rows in _chunks(len(batch), _SCENE_WORLDS[self.device.type], self.device)]
+            done = 0
+            while open_rows:
+                rows, room = open_rows.pop()
+                moved = self._launch_scenes(plan, rows, room, steps, down, -math.log1p(-damping), shown)
+                if moved is None and len(rows) > 1:
+                    open_rows += [(half, room) for half in rows.chunk(2)[::-1]]
                     continue
-                valid[rows] &= moved[2]
+                crowded = torch.ones_like(rows, dtype=torch.bool) if moved is None else moved[3]
+                if moved is not None and room < _MOST_ROOM and bool(crowded.any()):
+                    open_rows.append((rows[crowded], 4 * room))
+                    rows, moved, crowded = rows[~crowded], [item[~crowded] for item in moved], crowded[~crowded]
+                done += len(rows)
+                shown.update(done, "", f"simulated {done} of {len(batch)} scenes")
+                valid[rows] &= ~crowded if moved is None else moved[2] & ~crowded
+                if moved is None:
+                    continue
                 row, column = ((plan.category[rows, plan.fixed :] >= 0) & valid[rows, None]).nonzero().unbind(dim=1)
-                scene, slot = row + rows.start, plan.free[rows][row, column]
+                scene, slot = rows[row], plan.free[rows[row], column]
                 translation[scene, slot], rotation[scene, slot] = moved[0][row, column], moved[1][row, column]
             if lost := int((state.valid & ~valid).sum()):
                 _LOGGER.warning("%d of %d scenes are invalid: diverged, or more contacts than fit", lost, len(batch))
         return translation.float(), rotation.float(), valid
 
     def _launch_scenes(
-        self, plan: _Plan, rows: slice, steps: int, gravity: Array, damping: float, shown: Progress
-    ) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Asset frames (w, S, 3), (w, S, 3, 3) of the free objects after some steps and validity (w,); None where the
-        contacts did not fit.
+        self, plan: _Plan, rows: Tensor, room: int, steps: int, gravity: Array, damping: float, shown: Progress
+    ) -> list[Tensor] | None:
+        """Asset frames (w, S, 3), (w, S, 3, 3) of the free objects after some steps, whether (w,) they are finite, and
+        whether (w,) a scene had more than ``room`` contacts; None where there were too many in all.
         """
         wp, library, most = self._wp, self._library, _SCENE_WORLDS[self.device.type]
         category = plan.category[rows]
@@ -304,40 +313,36 @@ class WarpEngine:
         present, free = free >= 0, free.clamp(min=0)
         turn = plan.rotation[rows, fixed:] @ library.axes[free]
         center = plan.translation[rows, fixed:] + _turned(plan.rotation[rows, fixed:], library.center_of_mass[free])
-        start = torch.cat([center, matrix_to_quaternion(turn)], dim=-1)
+        aside, askew = plan.aside, plan.askew
+        start = torch.cat([center + aside, matrix_to_quaternion(askew @ turn)], dim=-1)
         column, part = plan.column[: plan.fixed_geometries], plan.part[: plan.fixed_geometries]
         owner = plan.rotation[rows][:, column]
         which = category[:, column].clamp(min=0)
         placed = plan.translation[rows][:, column] + _turned(owner, library.position[which, part])
         turned = owner @ library.rotation[which, part]
         limit = _PART_PAIRS[self.device.type]
-        contacts, constraints = min(limit, count * _CONTACTS), 3 * _CONTACTS
+        contacts = min(limit, count * room)
         while True:
-            data = self._mjw.make_data(
-                host, nworld=count, naconmax=contacts, njmax=constraints, njmax_nnz=12 * constraints
-            )
+            data = self._mjw.make_data(host, nworld=count, naconmax=contacts, njmax=3 * room, njmax_nnz=36 * room)
             wp.to_torch(data.geom_xpos)[:, : len(column)] = placed.float()
             wp.to_torch(data.geom_xmat)[:, : len(column)] = turned.float()
             qpos = wp.to_torch(data.qpos).unflatten(1, (-1, 7))
             qpos[present] = start[present].float()
             with self._compiling("motion", m.nv, shown=shown):
-                peak, crowded = self._steps(m, data, steps, contacts, constraints < _CONSTRAINTS)
-            if peak > contacts:
-                if contacts == limit:
-                    return None
-                contacts = min(limit, 2 * peak)
-            elif bool(crowded.any()) and constraints < _CONSTRAINTS:
-                constraints *= 2
-            else:
+                peak, crowded = self._steps(m, data, steps, contacts)
+            if peak <= contacts:
                 break
+            if contacts == limit:
+                return None
+            contacts = min(limit, 2 * peak)
         end = qpos.double()
-        turn = quaternion_to_matrix(end[..., 3:]) @ library.axes[free].transpose(-1, -2)
-        finite = end.isfinite().all(dim=-1).all(dim=-1) & ~crowded
-        return end[..., :3] - _turned(turn, library.center_of_mass[free]), turn, finite
+        turn = askew.transpose(-1, -2) @ quaternion_to_matrix(end[..., 3:]) @ library.axes[free].transpose(-1, -2)
+        center = end[..., :3] - aside - _turned(turn, library.center_of_mass[free])
+        return [center, turn, end.isfinite().all(dim=-1).all(dim=-1), crowded]
 
-    def _steps(self, m: Any, data: Any, steps: int, contacts: int, stop: bool) -> tuple[int, Tensor]:
+    def _steps(self, m: Any, data: Any, steps: int, contacts: int) -> tuple[int, Tensor]:
         """Advance all worlds: the most part pairs or contacts of a step, and worlds (w,) of too many constraints. Ends
-        early where there are more than ``contacts``, or, if ``stop``, too many constraints.
+        early where there are more than ``contacts``.
         """
         wp, mjw = self._wp, self._mjw
         counters = [wp.to_torch(counter) for counter in (data.ncollision, data.nacon)]
@@ -360,7 +365,7 @@ class WarpEngine:
                 wp.capture_launch(graph)
             peak = torch.maximum(peak, torch.maximum(*counters))
             seen |= overflow
-            if index % _CHECK == 0 and (int(peak) > contacts or (stop and bool((seen & flags).any()))):
+            if index % _CHECK == 0 and int(peak) > contacts:
                 break
         return int(peak), (seen & flags) != 0
 
@@ -430,7 +435,8 @@ class _Plan:
     """Objects of a batch as columns of one model: the welded ones, then the free ones by number of parts and pose.
 
     ``category`` (B, F + S) is -1 where a column is empty; ``translation`` and ``rotation`` (B, F + S, ...) are their
-    poses, and ``free`` (B, S) their slots. Geometry g is part ``part[g]`` of column ``column[g]``.
+    poses, and ``free`` (B, S) their slots. ``aside`` (S, 3) m and ``askew`` (S, 3, 3) are to be added to poses, for the
+    reason of :data:`_ASIDE`. Geometry g is part ``part[g]`` of column ``column[g]``.
     """
 
     def __init__(self, state: _State, library: _Library) -> None:
@@ -458,6 +464,11 @@ class _Plan:
         self.fixed_geometries = sum(sizes[: self.fixed])
         self.sizes = self.fixed_geometries, tuple(sizes[self.fixed :])
         self.column = columns.repeat_interleave(most)
+        generator = torch.Generator().manual_seed(0)
+        x, y, z, *aside = torch.randn(6, bodies, generator=generator, dtype=torch.float64).to(device)
+        none = torch.zeros_like(x)
+        turn = torch.stack([none, -z, y, z, none, -x, -y, x, none], dim=-1).reshape(-1, 3, 3)
+        self.aside, self.askew = 5e-7 * torch.stack(aside, dim=-1), torch.eye(3, device=device) + 1e-6 * turn
         self.part = torch.cat([torch.arange(size, device=device) for size in sizes] or [columns])
 
 
@@ -570,17 +581,9 @@ def _template(mujoco: Any, fixed: int, parts: tuple[int, ...], *, multiple: bool
     return spec.compile()
 
 
-def _launches(count: int, most: int, launch: Callable[[slice], Any]) -> Iterator[tuple[slice, Any]]:
-    """Rows and result of launches of at most ``most`` rows, halved where it is None; None where one row is too many."""
-    open_rows = [slice(start, min(start + most, count)) for start in range(0, count, most)][::-1]
-    while open_rows:
-        rows = open_rows.pop()
-        result = launch(rows)
-        if result is None and rows.stop - rows.start > 1:
-            middle = (rows.start + rows.stop) // 2
-            open_rows += [slice(middle, rows.stop), slice(rows.start, middle)]
-        else:
-            yield rows, result
+def _chunks(count: int, most: int, device: torch.device) -> list[Tensor]:
+    """Numbers below ``count`` in runs of at most ``most``, the first run last."""
+    return list(torch.arange(count, device=device).split(most))[::-1] if count else []
 
 
 def _padded(rows: Tensor, count: int, value: float) -> Tensor:
