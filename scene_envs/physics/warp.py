@@ -40,8 +40,10 @@ _SCENE_WORLDS = {"cuda": 1024, "cpu": 32}
 """Most scenes of a launch."""
 _BODIES = (4, 8, 16, 24, 32, 48, 64, 96, 128)
 """Numbers of free bodies of a model; kernels depend on it."""
-_ROOM, _MOST_ROOM = 384, 384 * 64
+_ROOM, _MOST_ROOM = 1 << 10, 1 << 14
 """Contacts of a scene for which there is room at first, and at most: a scene with more is simulated again."""
+_CONTACTS = 384
+"""Contacts, or pairs of near parts, per scene of a launch for which there is room at first."""
 _MODELS = 8
 """Models kept at a time."""
 _CHECK = 10
@@ -172,7 +174,7 @@ class WarpEngine:
         return scene, one, two
 
     def _depths(self, state: _State, scene: Tensor, one: Tensor, two: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Depth (P,) m, normal (P, 3) in the world from ``one`` to ``two``, and whether (P,) a pair was not computed."""
+        """Depth (P,) m, normal (P, 3) in the world from ``one`` to ``two``, and whether (P,) a pair was left out."""
         turn = state.rotation[scene, one]
         relative = turn.transpose(1, 2) @ state.rotation[scene, two]
         moved = _turned(turn.transpose(1, 2), state.translation[scene, two] - state.translation[scene, one])
@@ -321,7 +323,7 @@ class WarpEngine:
         placed = plan.translation[rows][:, column] + _turned(owner, library.position[which, part])
         turned = owner @ library.rotation[which, part]
         limit = _PART_PAIRS[self.device.type]
-        contacts = min(limit, count * room)
+        contacts = min(limit, count * _CONTACTS)
         while True:
             data = self._mjw.make_data(host, nworld=count, naconmax=contacts, njmax=3 * room, njmax_nnz=36 * room)
             wp.to_torch(data.geom_xpos)[:, : len(column)] = placed.float()
@@ -418,7 +420,7 @@ class _State:
     """Poses of a batch in float64 on the device; scenes with a pose that is not finite count as empty."""
 
     def __init__(self, batch: SceneBatch, device: torch.device) -> None:
-        tensor = batch.tensor.to(device)
+        tensor = batch.tensor.detach().to(device)
         self.valid = tensor.isfinite().all(dim=-1).all(dim=-1)
         self.pose = tensor[..., :12].double()
         self.translation, self.rotation = self.pose[..., :3], self.pose[..., 3:].unflatten(-1, (3, 3))

@@ -99,7 +99,7 @@ def test_objects_fall_as_bodies_fall_and_rest_where_they_stand(engine: WarpEngin
     assert rotations[0, 2].numpy() == pytest.approx(np.eye(3), abs=1e-5)
 
 
-def test_motion_does_not_depend_on_slots_and_heavy_objects_press_no_deeper(engine: WarpEngine) -> None:
+def test_motion_does_not_depend_on_slots_and_stacks_stand(engine: WarpEngine) -> None:
     batch = scene(("cube", 0.0, 0.0, 0.0), ("post", 0.02, 0.0, SIDE), ("bowl", 0.5, 0.0, 0.001))
     order = torch.tensor([2, 0, 4, 3, 1, *range(5, batch.tensor.shape[1])])
     one, turn, _ = engine.simulate(batch, 0.05)
