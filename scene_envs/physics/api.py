@@ -316,13 +316,15 @@ def _feasibility_on_device(
     found = engine.overlaps(batch)
     depth = torch.zeros_like(batch.translations[..., 0])
     for slot in (found.first, found.second):
-        depth.view(-1).index_reduce_(0, found.scene * depth.shape[1] + slot, found.depth.float(), "amax")
+        depth.view(-1).scatter_reduce_(0, found.scene * depth.shape[1] + slot, found.depth.float(), "amax")
     kept = free & (depth <= max_penetration)
     displacement, rotation, valid = _motion_on_device(batch.keeping(kept), duration)
     valid = valid & found.valid
     feasible = kept & (displacement <= max_displacement) & (rotation <= max_rotation) & batch.in_workspace
-    feasible, *others = (values * valid[:, None] for values in (feasible, depth, displacement, rotation))
-    return FeasibilityResult(feasible, *others, valid=valid, counts=feasible.sum(dim=-1))
+    judged = valid[:, None]
+    feasible = feasible & judged
+    motion = displacement * judged, rotation * judged
+    return FeasibilityResult(feasible, depth * judged, *motion, valid, feasible.sum(dim=-1))
 
 
 def _motion_on_device(batch: SceneBatch, duration: float) -> tuple[Tensor, Tensor, Tensor]:
