@@ -10,10 +10,10 @@ import torch
 from fcl import Transform
 from scipy.spatial.transform import Rotation
 
+from scene_envs.assets.fcl import Broadphase, Shapes, convex
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics.collision import PenetrationDepth
-from scene_envs.physics.fcl import Broadphase, Shapes, convex
 from scene_envs.physics.grasping import TOUCHING, Gripper, reachable
 from scene_envs.physics.placement import PlacedParts
 from scene_envs.scene import SceneBatch
