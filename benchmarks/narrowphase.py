@@ -34,7 +34,7 @@ Pair = tuple[Array, Array, Array, Array]
 
 FAILURE, NOTED = 1e-5, 1e-6
 """Errors (m) above which a depth is wrong, and above which it is counted."""
-BLOCK, FAR = 256, 50.0
+BLOCK, FAR = 256, 16.0
 """Number of pairs that are measured together, and distance (m) between them."""
 _SAME_NORMAL = 1e-10
 """Faces whose unit normals differ by less than this are one face."""
@@ -307,7 +307,8 @@ def measured(overlaps: Overlaps, placed: PlacedParts, first: Index, second: Inde
     for start in range(0, len(first), BLOCK):
         block = np.arange(start, min(start + BLOCK, len(first)))
         rows = np.stack([first[block], second[block]], axis=1)
-        places = FAR * np.stack(np.unravel_index(np.arange(len(block)), (8, 8, BLOCK // 64)), axis=1)
+        grid = np.array([8, 8, BLOCK // 64])
+        places = FAR * (np.stack(np.unravel_index(np.arange(len(block)), grid), axis=1) - 0.5 * (grid - 1))
         translation = placed.translation[rows] - placed.translation[rows[:, :1]] + places[:, None]
         found = overlaps(placed.part[rows].ravel(), placed.rotation[rows.ravel()], translation.reshape(-1, 3))
         assert found is not None

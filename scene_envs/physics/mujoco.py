@@ -10,7 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.engines import DAMPING, Course, Moved, gravity
@@ -45,7 +45,7 @@ _ITERATIONS = 200
 _THICKNESS = 1e-7
 """A part without extent in some direction gets this one (m) to both sides, since MuJoCo wants a volume."""
 _SAME = 1e-6
-"""Bodies of one kind closer than this (m) are moved apart by it before they are asked for their overlap: MuJoCo does
+"""Bodies closer than this (m) are moved apart by it before they are asked for their overlap: MuJoCo does
 not notice that two equal meshes at one pose overlap."""
 _CERTAIN = 2.5e-6
 """Largest difference (m) of MuJoCo's depth and the width of both parts along its normal at which the width is taken as
@@ -245,7 +245,7 @@ class Overlaps:
         fixed = np.zeros(len(kind), dtype=bool) if fixed is None else fixed
         if self._work(kind, translation, fixed) > _TOO_MANY:
             return None
-        position = _parted(kind, translation)
+        position = _parted(translation)
         with self._lock:
             stage = self._models.stage(kind, fixed)
             rows = stage.place(kind, fixed, position, np.roll(quaternions(rotation), 1, axis=1))
@@ -291,14 +291,17 @@ class Overlaps:
         return np.maximum(width, 0.0)  # type: ignore[no-any-return]
 
 
-def _parted(kind: Index, position: Array) -> Array:
-    """``position`` (n, 3) m, with bodies of one ``kind`` (n,) that coincide moved apart by ``_SAME``."""
-    order = np.lexsort((*position.T, kind))
-    near = (np.abs(np.diff(position[order], axis=0)) < _SAME).all(axis=1) & (np.diff(kind[order]) == 0)
-    if not near.any():
+def _parted(position: Array) -> Array:
+    """``position`` (n, 3) m, with bodies that coincide moved apart by ``_SAME``."""
+    near = cKDTree(position).query_pairs(_SAME, p=np.inf, output_type="ndarray")
+    if not len(near):
         return position
-    run = np.concatenate([[0], np.cumsum(near)])
-    rank = run - np.maximum.accumulate(np.where(np.concatenate([[False], near]), 0, run))
+    order = np.lexsort(position.T)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    rank = np.zeros(len(order), dtype=np.int64)  # larger than that of all near bodies before it
+    for one, other in sorted(np.sort(place[near], axis=1).tolist()):
+        rank[other] = max(rank[other], rank[one] + 1)
     position = position.copy()
     position[order] += _SAME * rank[:, None] * (0.48, 0.6, 0.64)
     return position
