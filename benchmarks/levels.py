@@ -31,7 +31,7 @@ from scene_envs.scene_types import list_scene_types
 
 def simulated_fine(batch: SceneBatch, *, everything: bool) -> FeasibilityResult:
     """Feasibility with fine parts throughout; with ``everything``, every object is simulated."""
-    physics = physics_of(batch.scene_type)
+    physics = physics_of(batch.scene_type, "bullet")
 
     def all_fine(objects: Objects, pairs: ObjectPairs) -> np.ndarray:
         return physics.support.hollow[objects.category]

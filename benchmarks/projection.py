@@ -222,7 +222,7 @@ class SmallProgram:
 def objects_of(batch: SceneBatch) -> Objects:
     """The objects of a batch of one scene."""
     return flatten(
-        physics_of(batch.scene_type).library,
+        physics_of(batch.scene_type, "bullet").library,
         batch.translations.double().numpy(),
         batch.rotations.double().numpy(),
         batch.categories.numpy(),
@@ -232,7 +232,7 @@ def objects_of(batch: SceneBatch) -> Objects:
 
 def compare(batch: SceneBatch, starts: int, rng: np.random.Generator) -> tuple[list[float], int, int]:
     """Ratios of the distance moved by projection to that by SLSQP, and the numbers of scenes that each solved alone."""
-    physics = physics_of(batch.scene_type)
+    physics = physics_of(batch.scene_type, "bullet")
     ratios, solved, alone = [], 0, 0
     for index in range(len(batch)):
         one = batch[index]

@@ -47,6 +47,8 @@ _THICKNESS = 1e-7
 _SAME = 1e-6
 """Bodies are moved by up to this (m) in each direction before MuJoCo is asked for their overlaps: it does not notice the
 overlap of two meshes with one centre and parallel faces."""
+_ASIDE = (0.6180339887, 0.7548776662, 0.8191725134)
+"""Steps in units of ``_SAME``, modulo 1, between the moves of consecutive bodies along each axis: no two are equal."""
 _CERTAIN = 3.5e-6
 """Largest difference (m) of MuJoCo's depth and the width of both parts along its normal at which the width is taken as
 the depth: the true depth is between the two."""
@@ -247,7 +249,7 @@ class Overlaps:
         fixed = np.zeros(len(kind), dtype=bool) if fixed is None else fixed
         if self._work(kind, translation, fixed) > _TOO_MANY:
             return None
-        position = _parted(kind, translation)
+        position = _parted(translation)
         with self._lock:
             stage = self._models.stage(kind, fixed)
             rows = stage.place(kind, fixed, position, np.roll(quaternions(rotation), 1, axis=1))
@@ -291,19 +293,6 @@ class Overlaps:
             except (QhullError, ValueError):  # no volume
                 width[row] = 0.0
         return np.maximum(width, 0.0)  # type: ignore[no-any-return]
-
-
-def _parted(kind: Index, position: Array) -> Array:
-    """``position`` (n, 3) m, each moved by up to ``_SAME`` that depends on the body alone; bodies of one ``kind`` (n,)
-    that coincide are moved apart.
-    """
-    golden = np.array([0.6180339887, 0.7548776662, 0.8191725134])
-    order = np.lexsort((*position.T, kind))
-    near = (np.abs(np.diff(position[order], axis=0)) < _SAME).all(axis=1) & (np.diff(kind[order]) == 0)
-    rank = np.zeros(len(kind))
-    run = np.concatenate([[0], np.cumsum(near)])
-    rank[order] = run - np.maximum.accumulate(np.where(np.concatenate([[False], near]), 0, run))
-    return position + _SAME * np.modf((1.0 + kind + 0.37 * rank)[:, None] * golden + np.abs(1e3 * position))[0]
 
 
 class MujocoEngine:

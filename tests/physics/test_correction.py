@@ -29,7 +29,7 @@ def after(scene: SceneBatch, spread: np.ndarray = EVEN, movable: np.ndarray | No
 
 def fallen(scene: SceneBatch, limit: float = 0.03) -> torch.Tensor:
     """(N,) falls of the first scene, m."""
-    physics = physics_of(scene.scene_type)
+    physics = physics_of(scene.scene_type, "bullet")
     categories = scene.categories.numpy()
     welded = np.isin(categories, np.array(scene.scene_type.welded_categories))
     poses = scene.translations.double().numpy(), scene.rotations.double().numpy()

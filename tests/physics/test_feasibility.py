@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -12,7 +11,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from scene_envs.errors import InvalidInputError, MissingDependencyError
+from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import (
     PhysicsPool,
@@ -24,8 +23,7 @@ from scene_envs.physics import (
     project,
     settle,
 )
-from scene_envs.physics.bullet import World
-from scene_envs.physics.motion import Physics, physics_of
+from scene_envs.physics.motion import physics_of
 from scene_envs.physics.placement import Objects
 from scene_envs.physics.statics import Rest
 from scene_envs.scene import SceneBatch
@@ -82,7 +80,7 @@ def test_free_fall_has_its_closed_form() -> None:
 def test_the_closed_form_of_a_lone_object_agrees_with_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
     batch = SceneBatch.concatenate([scene(("cube", 0.3, -0.2, gap), yaw=0.4) for gap in (-0.0005, 0.0, 0.0007, 0.004)])
     quick = feasibility(batch)
-    monkeypatch.setattr(physics_of(TYPE).statics, "at_rest", nothing_rests)
+    monkeypatch.setattr(physics_of(TYPE, "bullet").statics, "at_rest", nothing_rests)
     slow = feasibility(batch)
     assert torch.equal(quick.feasible, slow.feasible)
     torch.testing.assert_close(quick.displacement, slow.displacement, atol=2e-4, rtol=0)
@@ -136,7 +134,7 @@ def test_coarse_shapes_give_the_verdict_of_fine_ones(monkeypatch: pytest.MonkeyP
     """At most one object in a hundred differs, over scenes at rest and jittered ones."""
     batch = SceneBatch.concatenate([dimsum(3, 6), jittered(dimsum(3, 7), 1)])
     mixed = feasibility(batch)
-    support = physics_of(batch.scene_type).support
+    support = physics_of(batch.scene_type, "bullet").support
     monkeypatch.setattr(support, "needs_fine", lambda objects, pairs: support.hollow[objects.category])
     fine = feasibility(batch)
     assert int((mixed.feasible != fine.feasible).sum()) <= 0.01 * int(batch.is_free.sum())
@@ -148,8 +146,7 @@ def test_a_result_depends_on_its_scene_alone() -> None:
     batch = SceneBatch.concatenate([dimsum(4, 8), jittered(dimsum(4, 9), 2)])
     first = feasibility(batch)
     backward = feasibility(batch[list(range(len(batch)))[::-1]])
-    physics = physics_of(batch.scene_type)
-    physics.__dict__.pop("world", None)
+    physics_of(batch.scene_type, "bullet").engine.__dict__.pop("_pool", None)
     alone = [feasibility(batch[index]) for index in (7, 2, 5)]
     assert torch.equal(backward.displacement.flip(0), first.displacement)
     assert torch.equal(backward.rotation.flip(0), first.rotation)
@@ -214,21 +211,6 @@ def test_what_is_not_ready_gets_more_rounds_and_the_rest_stays() -> None:
 def test_at_least_one_round_is_needed_to_be_ready() -> None:
     with pytest.raises(InvalidInputError, match="rounds=0 must be at least 1"):
         make_ready(scene(("cube", 0.0, 0.0, 0.0)), rounds=0)
-
-
-def test_without_pybullet_only_settling_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    real_import = builtins.__import__
-
-    def no_bullet(name: str, *rest: Any, **more: Any) -> Any:
-        if name == "pybullet":
-            raise ImportError("No module named 'pybullet'")
-        return real_import(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", no_bullet)
-    physics = Physics(physics_of(TYPE).library)
-    with pytest.raises(MissingDependencyError, match="pip install pybullet"):
-        World(physics.library)
-    assert penetration(scene(*tower(2))).valid.tolist() == [True]
 
 
 @pytest.mark.slow

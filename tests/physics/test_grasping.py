@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from scene_envs.assets.fcl import Broadphase, Shapes, convex
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
-from scene_envs.physics.collision import PenetrationDepth
 from scene_envs.physics.grasping import TOUCHING, Gripper, reachable
-from scene_envs.physics.placement import PlacedParts
+from scene_envs.physics.mujoco import Overlaps
 from scene_envs.scene import SceneBatch
 from tests.helpers.simple_scenes import SIDE, scene
 
@@ -102,19 +101,19 @@ def test_the_gripper_meets_what_is_deeper_than_a_tenth_of_a_millimetre() -> None
     tree = Broadphase(chain(*Shapes(library).place(categories, rotations, translations)))
     owner = [row for row, category in enumerate(categories) for _ in library[category].fine]
     whole = [part.vertices + TOUCHING * np.sign(part.vertices - part.vertices.mean(axis=0)) for part in gripper.body()]
-    depth = PenetrationDepth([*whole, *(part.vertices for category in categories for part in library[category].fine)])
-    first, second = (index.ravel() for index in np.meshgrid(np.arange(3), 3 + np.arange(len(owner))))
+    parts = [*whole, *(part.vertices for category in categories for part in library[category].fine)]
+    overlaps = Overlaps(parts, [[0, 1, 2], *([3 + row] for row in range(len(owner)))])
+    kind = np.arange(1 + len(owner))
     places = np.random.default_rng(0).uniform((-0.5, -0.5, 0.0), (0.5, 0.5, 0.25), (150, 3))
     body, found = [convex(part) for part in gripper.body()], []
     for turn, place in zip(Rotation.random(150, random_state=0).as_matrix(), places, strict=True):
         for part in body:
             part.setTransform(Transform(turn, place))
         found.append(any(map(tree.meets, body)))
-        turns = np.concatenate([np.broadcast_to(turn, (3, 3, 3)), rotations[owner]])
-        placed = PlacedParts(
-            np.arange(3 + len(owner)), turns, np.concatenate([np.broadcast_to(place, (3, 3)), translations[owner]])
-        )
-        deepest = depth(placed, first, second)[0].max()
+        turns, at = np.concatenate([turn[None], rotations[owner]]), np.concatenate([place[None], translations[owner]])
+        met = overlaps(kind, turns, at, kind > 0)
+        assert met is not None
+        deepest = met[2].max(initial=0.0)
         assert TOUCHING < deepest < 3**0.5 * TOUCHING or found[-1] is bool(deepest > TOUCHING)
     assert 10 < sum(found) < 140
 

@@ -189,7 +189,7 @@ def shared_ray_pool(ray_pool: PhysicsPool, monkeypatch: pytest.MonkeyPatch) -> N
     """What asks for workers on Ray gets those of ``ray_pool`` and leaves them running: each takes seconds to start."""
     monkeypatch.setattr(
         "scene_envs.physics.make_pool",
-        lambda workers, *timeout: ray_pool if workers == "ray" else make_pool(workers, *timeout),
+        lambda workers, **options: ray_pool if workers == "ray" else make_pool(workers, **options),
     )
     monkeypatch.setattr(ray_pool, "close", lambda: None)
 

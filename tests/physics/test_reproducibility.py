@@ -87,16 +87,16 @@ def test_the_order_of_slots_changes_no_settled_scene() -> None:
 def test_an_interrupted_simulation_changes_no_later_one(monkeypatch: pytest.MonkeyPatch) -> None:
     batch, other = crowded(TYPE, NOISE[:1], seed=12), crowded(TYPE, NOISE[:1], seed=13)
     expected = feasibility(other)
-    world = physics_of(batch.scene_type).world
-    still = world._is_still
+    engine = physics_of(batch.scene_type, "bullet").engine
+    still = engine._is_still  # type: ignore[attr-defined]
 
     def interrupted(*arguments: object) -> bool:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(world, "_is_still", interrupted)
+    monkeypatch.setattr(engine, "_is_still", interrupted)
     with pytest.raises(KeyboardInterrupt):
         settle(batch)
-    monkeypatch.setattr(world, "_is_still", still)
+    monkeypatch.setattr(engine, "_is_still", still)
     found = feasibility(other)
     assert torch.equal(found.displacement, expected.displacement)
     assert torch.equal(found.feasible, expected.feasible)

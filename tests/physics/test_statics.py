@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import FeasibilityResult, equilibrium, feasibility, make_ready, settle
-from scene_envs.physics.bullet import World
+from scene_envs.physics.bullet import BulletEngine
 from scene_envs.physics.motion import Physics, physics_of
 from scene_envs.physics.placement import ObjectPairs, Objects
 from scene_envs.physics.statics import Rest
@@ -30,7 +30,7 @@ def simulated(batch: SceneBatch, monkeypatch: pytest.MonkeyPatch, **options: Any
     def nothing(self: Physics, objects: Objects, pairs: ObjectPairs, duration: float) -> Rest:
         return Rest(np.zeros(len(objects), bool), np.zeros(len(objects)), np.zeros(len(objects)))
 
-    support = physics_of(batch.scene_type).support
+    support = physics_of(batch.scene_type, "bullet").support
     with monkeypatch.context() as patch:
         patch.setattr(Physics, "rest", nothing)
         patch.setattr(support, "needs_fine", lambda objects, pairs: support.hollow[objects.category])
@@ -40,13 +40,13 @@ def simulated(batch: SceneBatch, monkeypatch: pytest.MonkeyPatch, **options: Any
 def simulations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """A list that grows by the number of free objects whenever something is simulated."""
     counts: list[int] = []
-    real = World.simulate
+    real = BulletEngine.simulate
 
-    def spy(self: World, objects: Objects, *rest: Any) -> Any:
+    def spy(self: BulletEngine, objects: Objects, *rest: Any) -> Any:
         counts.append(int((~objects.fixed).sum()))
         return real(self, objects, *rest)
 
-    monkeypatch.setattr(World, "simulate", spy)
+    monkeypatch.setattr(BulletEngine, "simulate", spy)
     return counts
 
 
