@@ -168,6 +168,8 @@ class _Stage:
                 continue
             model.body_mass[number] = model.body_subtreemass[number] = body.mass
             model.body_inertia[number] = body.moments
+            # the mass matrix of a body that moves freely in the frame of its principal axes is copied from here
+            model.dof_M0[6 * number - 6 : 6 * number] = [*[body.mass] * 3, *body.moments]
             weights = 1.0 / body.mass, float((1.0 / body.moments).mean())
             model.body_invweight0[number] = weights
             model.dof_invweight0[6 * number - 6 : 6 * number] = np.repeat(weights, 3)

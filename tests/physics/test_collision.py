@@ -19,7 +19,7 @@ from benchmarks.narrowphase import minkowski_depth, sample
 from rewards import evaluate_reward, make_reward
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
+from scene_envs.physics import EngineName, equilibrium, feasibility, make_ready, penetration, project, settle
 from scene_envs.physics.api import run_kernel, spent, stack
 from scene_envs.physics.collision import PenetrationDepth
 from scene_envs.physics.parts import PartFeatures
@@ -56,6 +56,12 @@ def test_engines_agree_on_two_equal_objects_at_one_pose() -> None:
     ours, mujoco = (penetration(batch, physics=name).depth.amax(dim=1) for name in ("bullet", "mujoco"))
     assert ours.min() > 1e-3
     torch.testing.assert_close(mujoco, ours, atol=1e-7, rtol=0.0)
+
+
+@pytest.mark.parametrize("engine", ["bullet", "mujoco"])
+def test_a_box_in_the_air_falls_with_gravity_in_every_engine(engine: EngineName) -> None:
+    moved = equilibrium(scene(("cube", 0.0, 0.0, 0.5)), duration=0.1, physics=engine)
+    assert float(moved.displacement[0, 1]) == pytest.approx(9.81 * 0.1**2 / 2, rel=0.03)  # steps of 2 ms add 2 %
 
 
 def test_edges_that_cross_are_measured_exactly() -> None:
