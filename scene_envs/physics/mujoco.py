@@ -45,8 +45,8 @@ _ITERATIONS = 200
 _THICKNESS = 1e-7
 """A part without extent in some direction gets this one (m) to both sides, since MuJoCo wants a volume."""
 _SAME = 1e-6
-"""Bodies are moved by up to this (m) in each direction before MuJoCo is asked for their overlaps: it does not notice the
-overlap of two meshes with one centre and parallel faces."""
+"""Bodies are moved by up to this (m) in each direction before MuJoCo is asked for their overlaps: it does not notice
+the overlap of two meshes with one centre and parallel faces."""
 _ASIDE = (0.6180339887, 0.7548776662, 0.8191725134)
 """Steps in units of ``_SAME``, modulo 1, between the moves of consecutive bodies along each axis: no two are equal."""
 _CERTAIN = 3.5e-6
@@ -249,7 +249,8 @@ class Overlaps:
         fixed = np.zeros(len(kind), dtype=bool) if fixed is None else fixed
         if self._work(kind, translation, fixed) > _TOO_MANY:
             return None
-        position = _parted(translation)
+        aside = np.modf((1.0 + np.arange(len(kind)))[:, None] * _ASIDE)[0]
+        position = translation + _SAME * aside
         with self._lock:
             stage = self._models.stage(kind, fixed)
             rows = stage.place(kind, fixed, position, np.roll(quaternions(rotation), 1, axis=1))
