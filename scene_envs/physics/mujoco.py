@@ -10,7 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.engines import DAMPING, Course, Moved, gravity
@@ -47,8 +47,8 @@ _THICKNESS = 1e-7
 _SAME = 1e-6
 """Bodies are moved by up to this (m) in each direction before MuJoCo is asked for their overlaps: it does not notice
 the overlap of two meshes with one centre and parallel faces."""
-_ASIDE = (0.6180339887, 0.7548776662, 0.8191725134)
-"""Steps in units of ``_SAME``, modulo 1, between the moves of consecutive bodies along each axis: no two are equal."""
+_ROUNDING = 1e-9
+"""Overlap (m) that may be a rounding error of bodies that touch."""
 _CERTAIN = 3.5e-6
 """Largest difference (m) of MuJoCo's depth and the width of both parts along its normal at which the width is taken as
 the depth: the true depth is between the two."""
@@ -249,8 +249,7 @@ class Overlaps:
         fixed = np.zeros(len(kind), dtype=bool) if fixed is None else fixed
         if self._work(kind, translation, fixed) > _TOO_MANY:
             return None
-        aside = np.modf((1.0 + np.arange(len(kind)))[:, None] * _ASIDE)[0]
-        position = translation + _SAME * aside
+        position = translation + _aside(kind, translation)
         with self._lock:
             stage = self._models.stage(kind, fixed)
             rows = stage.place(kind, fixed, position, np.roll(quaternions(rotation), 1, axis=1))
@@ -259,6 +258,7 @@ class Overlaps:
             return None
         body, part, depth, normal = rows[found[0]], found[1], found[2], found[3]
         depth = self._certain(part, rotation[body], translation[body], depth, normal)
+        body, depth = body[depth > _ROUNDING], depth[depth > _ROUNDING]
         return body.min(axis=1), body.max(axis=1), depth
 
     def _work(self, kind: Index, translation: Array, fixed: Mask) -> int:
@@ -294,6 +294,21 @@ class Overlaps:
             except (QhullError, ValueError):  # no volume
                 width[row] = 0.0
         return np.maximum(width, 0.0)  # type: ignore[no-any-return]
+
+
+def _aside(kind: Index, position: Array) -> Array:
+    """(n, 3) m, moves of up to ``_SAME`` that depend on the ``kind`` (n,) and ``position`` (n, 3) m of each body alone,
+    and on its number among bodies that coincide.
+    """
+    steps = np.array([0.6180339887, 0.7548776662, 0.8191725134])
+    order = np.lexsort((*position.T, kind))
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    rank = np.zeros(len(order), dtype=np.int64)  # larger than that of all coinciding bodies before it
+    near = cKDTree(position).query_pairs(_SAME, p=np.inf, output_type="ndarray")
+    for one, other in sorted(np.sort(place[near], axis=1).tolist()):
+        rank[other] = max(rank[other], rank[one] + 1)
+    return _SAME * np.modf((1.0 + kind + 0.37 * rank[place])[:, None] * steps + np.abs(1e3 * position))[0]  # type: ignore[no-any-return]
 
 
 class MujocoEngine:
