@@ -1,9 +1,10 @@
 """Checks of scene_envs on Python versions beside that of .venv, without torch. Usage: .venv/bin/python .ci/smoke.py
 
-Makes a temporary environment for each of the versions whose interpreter is on this machine, with the newest packages
+Makes an environment in build/ for each of the versions whose interpreter is on this machine, with the newest packages
 that pyproject.toml allows, and runs the checks there; versions without interpreter are named and left out. All versions
-run at the same time. Torch has no small wheel for every version, so what needs it is left out: batches of scenes,
-grammars, environments, priors, training and commands. Exit status 1 when a check failed.
+run at the same time. An environment is made again when the packages in pyproject.toml have changed. Torch has no small
+wheel for every version, so what needs it is left out: batches of scenes, grammars, environments, priors, training and
+commands. Exit status 1 when a check failed.
 
     python .ci/smoke.py check    # the checks alone, in the current environment
 """
@@ -26,7 +27,7 @@ VERSIONS = ("3.12", "3.13")
 PACKAGES = ("gymnasium", "numpy", "scipy", "trimesh", "mujoco", "pillow", "pyyaml", "rich", "jinja2", "markupsafe")
 """Dependencies of scene_envs without torch; ``EXTRA`` is of the tests."""
 EXTRA = ("python-fcl", "usd-core")
-LIMIT = 110.0
+LIMIT = 300.0
 """Seconds for each step of a version."""
 
 
@@ -208,25 +209,26 @@ def requirements() -> list[str]:
 
 
 def smoke(version: str, python: str) -> tuple[int, str]:
-    """Exit status and output of the checks in a new environment."""
-    started = time.perf_counter()
-    with tempfile.TemporaryDirectory(prefix=f"smoke-{version}-") as folder:
-        own = f"{folder}/bin/python"
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
-        pip = [own, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile", *requirements()]
-        said = ""
-        for command in ([python, "-m", "venv", folder], pip, [own, __file__, "check"]):
-            try:
-                done = subprocess.run(
-                    command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=LIMIT
-                )
-            except subprocess.TimeoutExpired:
-                return 1, f"Python {version}: longer than {LIMIT:.0f} s at: {' '.join(command)}"
-            if command[-1] == "check" or done.returncode:
-                said += done.stdout
-            if done.returncode:
-                break
-    return done.returncode, f"Python {version}, {time.perf_counter() - started:.0f} s:\n{said.rstrip()}"
+    """Exit status and output of the checks in the environment of this version."""
+    started, folder = time.perf_counter(), ROOT / "build" / f"smoke-{version}"
+    own, installed, packages = str(folder / "bin/python"), folder / "installed", requirements()
+    check = [own, __file__, "check"]
+    make = [python, "-m", "venv", "--clear", str(folder)]
+    pip = [own, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile", *packages]
+    fresh = not installed.exists() or installed.read_text(encoding="utf-8") != repr(packages)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
+    for command in (make, pip, check) if fresh else (check,):
+        try:
+            done = subprocess.run(
+                command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=LIMIT
+            )
+        except subprocess.TimeoutExpired:
+            return 1, f"Python {version}: longer than {LIMIT:.0f} s at: {' '.join(command)}"
+        if done.returncode:
+            break
+        if command is pip:
+            installed.write_text(repr(packages), encoding="utf-8")
+    return done.returncode, f"Python {version}, {time.perf_counter() - started:.0f} s:\n{done.stdout.rstrip()}"
 
 
 def main() -> int:

@@ -38,8 +38,8 @@ class Clearance:
             raise InvalidInputError(f"clearance: wanted={self.wanted} must be a positive number of metres")
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """``per_object`` (B, N) is the gap over ``wanted``, at most 1. Terms: ``smallest_gap`` and ``mean_gap``, m, of
-        gaps up to ``wanted``, and ``crowded_objects``, whose gap is smaller; they have the flag ``crowded``.
+        """``per_object`` (B, N) is the gap over ``wanted``, at most 1. Terms: ``smallest_gap``, m, at most
+        ``wanted``, and ``crowded_objects``, whose gap is smaller; they have the flag ``crowded``.
         """
         from scene_envs.physics.api import chosen_pool, run_kernel, stack, valid_rows
 
@@ -50,7 +50,6 @@ class Clearance:
         crowded = counted & (share < 1)
         terms = {
             "smallest_gap": gap.masked_fill(~counted, self.wanted).amin(dim=-1),
-            "mean_gap": (gap * counted).sum(dim=-1) / counted.sum(dim=-1).clamp(min=1),
             "crowded_objects": crowded.sum(dim=-1).float(),
         }
         device = batch.tensor.device

@@ -297,6 +297,11 @@ class SceneBatch:
         """The same objects at new poses; (B, N, 3) m and (B, N, 3, 3)."""
         return SceneBatch.from_parts(translations, rotations, self.categories, self.scene_type)
 
+    def keeping(self, kept: Tensor) -> SceneBatch:
+        """The scenes without the free objects that are not in ``kept`` (B, N)."""
+        categories = self.categories.masked_fill(self.is_free & ~kept, self.scene_type.num_assets)
+        return SceneBatch.from_parts(self.translations, self.rotations, categories, self.scene_type)
+
     def __len__(self) -> int:
         return self._tensor.shape[0]
 

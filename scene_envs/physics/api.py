@@ -290,7 +290,10 @@ def feasibility(
         "max_rotation": max_rotation,
     }
     check_numbers(duration, **limits)
-    rows = run_kernel("feasibility", batch, limits | {"duration": duration}, chosen_pool(pool, physics))
+    pool = chosen_pool(pool, physics)
+    if pool.engine == "warp":
+        return _feasibility_on_device(batch, duration, **limits)
+    rows = run_kernel("feasibility", batch, limits | {"duration": duration}, pool)
     feasible = stack(rows, batch, "feasible", torch.bool) & batch.in_workspace.cpu()
     return FeasibilityResult(
         feasible=feasible,
@@ -300,6 +303,39 @@ def feasibility(
         valid=valid_rows(rows),
         counts=feasible.sum(dim=-1),
     )
+
+
+def _feasibility_on_device(
+    batch: SceneBatch, duration: float, *, max_penetration: float, max_displacement: float, max_rotation: float
+) -> FeasibilityResult:
+    """:func:`feasibility` by MuJoCo Warp; all tensors stay on the device of the batch."""
+    from scene_envs.physics.warp import warp_engine
+
+    require_rigid_poses(batch)
+    engine, free = warp_engine(batch.scene_type, batch.tensor.device), batch.is_free
+    found = engine.overlaps(batch)
+    depth = torch.zeros_like(batch.translations[..., 0])
+    for slot in (found.first, found.second):
+        depth.view(-1).scatter_reduce_(0, found.scene * depth.shape[1] + slot, found.depth.float(), "amax")
+    kept = free & (depth <= max_penetration)
+    displacement, rotation, valid = _motion_on_device(batch.keeping(kept), duration)
+    valid = valid & found.valid
+    feasible = kept & (displacement <= max_displacement) & (rotation <= max_rotation) & batch.in_workspace
+    judged = valid[:, None]
+    feasible = feasible & judged
+    motion = displacement * judged, rotation * judged
+    return FeasibilityResult(feasible, depth * judged, *motion, valid, feasible.sum(dim=-1))
+
+
+def _motion_on_device(batch: SceneBatch, duration: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Displacement (B, N) m and rotation (B, N) rad of free objects by MuJoCo Warp, and valid rows (B,)."""
+    from scene_envs.physics.warp import warp_engine
+
+    free = batch.is_free
+    translations, rotations, valid = warp_engine(batch.scene_type, batch.tensor.device).simulate(batch, duration)
+    still = torch.eye(3, device=free.device)
+    before, after = (torch.where(free[..., None, None], turn, still) for turn in (batch.rotations, rotations))
+    return (translations - batch.translations).norm(dim=-1) * free, geodesic_angle(before, after), valid
 
 
 def penetration(batch: SceneBatch, *, pool: PhysicsPool | None = None, physics: str | None = None) -> PenetrationResult:
@@ -350,7 +386,11 @@ def equilibrium(
     Raises InvalidInputError and MissingDependencyError as :func:`feasibility` does.
     """
     check_numbers(duration)
-    rows = run_kernel("equilibrium", batch, {"duration": duration}, chosen_pool(pool, physics))
+    pool = chosen_pool(pool, physics)
+    if pool.engine == "warp":
+        require_rigid_poses(batch)
+        return EquilibriumResult(*_motion_on_device(batch, duration))
+    rows = run_kernel("equilibrium", batch, {"duration": duration}, pool)
     return EquilibriumResult(stack(rows, batch, "displacement"), stack(rows, batch, "rotation"), valid_rows(rows))
 
 

@@ -21,6 +21,8 @@ from scene_envs.physics.placement import (
     separations,
 )
 
+TOUCHING = 2e-5
+"""Overlap (m) up to which the face-plane bound of coarse parts is taken as the depth, and none is computed exactly."""
 NEAR = 3e-3
 """Object pairs are listed when their boxes are at most this far apart (m)."""
 NEAR_FIXED = 0.06
@@ -73,7 +75,9 @@ class Collider:
             a, b = first[overlapping], second[overlapping]
             tests = np.bincount(objects.scene[a], weights=corner_tests(self.library, objects, a, b))
             rough[overlapping] = tests[objects.scene[a]] > TOO_MANY
-            exact = overlapping[~rough[overlapping]]
+            touching = overlapping[gap[overlapping] > -TOUCHING]
+            depth[touching] = -gap[touching]
+            exact = overlapping[~rough[overlapping] & (gap[overlapping] <= -TOUCHING)]
             involved = np.zeros(len(objects), dtype=bool)
             involved[first[exact]] = involved[second[exact]] = True
             found = self.overlaps(objects, involved)

@@ -16,7 +16,7 @@ import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.errors import InvalidInputError, MissingDependencyError
-from scene_envs.physics.parts import GRAVITY, LibraryGeometry
+from scene_envs.physics.parts import GRAVITY
 from scene_envs.physics.placement import Budget, Objects
 
 _LOGGER = logging.getLogger(__name__)
@@ -107,14 +107,3 @@ def engine_name(physics: str) -> str:
             f"install it with `{_INSTALL[physics]}`"
         )
     return physics
-
-
-def make_engine(name: str, library: LibraryGeometry) -> Engine:
-    """The CPU engine ``name`` for the assets of ``library``."""
-    if name == "bullet":
-        from scene_envs.physics.bullet import BulletEngine
-
-        return BulletEngine(library)
-    from scene_envs.physics.mujoco import MujocoEngine
-
-    return MujocoEngine(library)

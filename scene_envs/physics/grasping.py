@@ -14,9 +14,9 @@ from torch import Tensor
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.assets.base import AssetLibrary, ConvexPart
+from scene_envs.assets.fcl import Broadphase, convex, shapes_of
 from scene_envs.assets.shapes import box
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics.fcl import Broadphase, convex, shapes_of
 from scene_envs.scene import SceneBatch, require_rigid_poses
 
 TOUCHING = 1e-4
@@ -73,7 +73,7 @@ def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper:
     For each of A ``approaches``, directions in the world from the object to the waiting gripper, such as (0, 0, 1), it
     is tried at the middle and both edges of the object, with four closing directions and all reaches. It reaches the
     object when a fine convex part of it is between the fingers, and none of any object is in the fingers, the palm or
-    the palm's path, whose boxes are smaller by 0.1 mm on each side (:mod:`scene_envs.physics.fcl`).
+    the palm's path, whose boxes are smaller by 0.1 mm on each side (:mod:`scene_envs.assets.fcl`).
 
     Raises InvalidInputError for a matrix that is not a rotation; the message names its scene and slot.
     """
@@ -87,7 +87,8 @@ def reachable(batch: SceneBatch, approaches: Sequence[Sequence[float]], gripper:
     hand = _hand(batch.scene_type.library, gripper)
     for row, slots in enumerate(map(np.flatnonzero, categories < batch.scene_type.num_assets)):
         poses = rotations[row, slots], translations[row, slots]
-        met = hand.reach(categories[row, slots], *poses, np.flatnonzero(free[row, slots]), back)
+        with hand.shapes.lock:
+            met = hand.reach(categories[row, slots], *poses, np.flatnonzero(free[row, slots]), back)
         found[:, row, slots] = torch.from_numpy(met)
     return found.to(batch.tensor.device)
 
@@ -104,12 +105,8 @@ class _Hand:
 
     def reach(self, category: Index, rotation: Array, translation: Array, free: Index, back: Array) -> Mask:
         """(A, n) whether the gripper reaches the n objects of one scene from the directions ``back`` (A, 3); it is
-        tried at those of the rows ``free``.
+        tried at those of the rows ``free``. The caller holds the lock of the shapes.
         """
-        with self.shapes.lock:
-            return self._reach(category, rotation, translation, free, back)
-
-    def _reach(self, category: Index, rotation: Array, translation: Array, free: Index, back: Array) -> Mask:
         placed = self.shapes.place(category.tolist(), rotation, translation)
         scene, own = Broadphase(chain(*placed)), [Broadphase(placed[row]) for row in free]
         corners = [self.corners[category[row]] @ rotation[row].T + translation[row] for row in free]

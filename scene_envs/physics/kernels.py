@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from scene_envs.arrays import Array, Index
 from scene_envs.physics.collision import TOO_MANY, corner_tests
 from scene_envs.physics.engines import Course
 from scene_envs.physics.motion import Physics, motion, physics_of, settle_scene
-from scene_envs.physics.placement import Budget, ObjectPairs, Objects, flatten, place, simulation_units
+from scene_envs.physics.placement import Budget, ObjectPairs, Objects, flatten, object_boxes, place, simulation_units
 from scene_envs.physics.projection import TOLERANCE, heaps, project_objects
 from scene_envs.scene_types import SceneType
 
@@ -153,22 +154,42 @@ def furniture_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
 
 def gaps_kernel(chunk: Chunk, *, engine: str, limit: float) -> dict[str, Any]:
     """Gap (m, at most ``limit``) of each object to the nearest one that does not carry it and that it does not carry,
-    directly or through others.
+    directly or through others; 0 where they touch or overlap. Pairs of fixed objects do not count.
     """
     import torch  # the other kernels run in processes without torch
 
-    from scene_envs.physics.fcl import shapes_of, smallest_gaps
+    from scene_envs.assets.fcl import gap, shapes_of
     from scene_envs.supports import Contacts, Placed
 
     physics, objects, valid = _start(chunk, engine)
     poses = map(torch.from_numpy, (chunk.categories, chunk.translations, chunk.rotations))
     outlines, standing, _ = Placed.of_scenes(chunk.scene_type, *poses)
-    carries = Contacts.of(outlines, standing).holding().carries()
-    shapes, found = shapes_of(chunk.scene_type.library.assets), np.zeros(len(objects))
-    for rows in (np.flatnonzero(objects.scene == index) for index in range(len(chunk))):
-        placed = place(physics.library, objects[rows], "fine")
-        found[rows] = smallest_gaps(shapes, objects[rows], placed, carries[np.ix_(rows, rows)], limit)
-    return {"gap": _scatter(chunk, objects, found), "valid": valid}
+    ignored = Contacts.of(outlines, standing).holding().carries() | (objects.fixed[:, None] & objects.fixed)
+    ignored |= ignored.T | (objects.scene[:, None] != objects.scene)
+    placed = place(physics.library, objects, "fine")
+    shapes, nearest = shapes_of(chunk.scene_type.library.assets), np.full(len(objects), limit)
+    apart = _box_gaps(*object_boxes(placed), *object_boxes(placed))
+    first, second = np.nonzero(np.triu(~ignored & (apart < limit), 1))
+    with shapes.lock:
+        parts = list(chain(*shapes.place(objects.category.tolist(), objects.rotation, objects.translation)))
+        for pair in np.argsort(apart[first, second], kind="stable"):
+            a, b = first[pair], second[pair]
+            least = max(nearest[a], nearest[b])  # only a smaller gap matters
+            rows, columns = (slice(placed.start[i], placed.start[i] + placed.count[i]) for i in (a, b))
+            boxes = _box_gaps(placed.low[rows], placed.high[rows], placed.low[columns], placed.high[columns])
+            for index in np.argsort(boxes, axis=None, kind="stable"):
+                i, j = divmod(int(index), boxes.shape[1])
+                if boxes[i, j] >= least:
+                    break
+                least = min(least, gap(parts[rows.start + i], parts[columns.start + j]))
+            nearest[[a, b]] = np.minimum(nearest[[a, b]], least)
+    return {"gap": _scatter(chunk, objects, nearest), "valid": valid}
+
+
+def _box_gaps(low: Array, high: Array, other_low: Array, other_high: Array) -> Array:
+    """(n, m) m: distances of boxes (n, 3) to other boxes (m, 3)."""
+    between = np.maximum(low[:, None] - other_high, other_low - high[:, None])
+    return np.linalg.norm(np.maximum(between, 0.0), axis=-1)  # type: ignore[no-any-return]
 
 
 def settle_kernel(chunk: Chunk, *, engine: str, duration: float, iterations: int) -> dict[str, Any]:

@@ -10,7 +10,8 @@ import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import Collider
-from scene_envs.physics.engines import Course, Moved, make_engine
+from scene_envs.physics.engines import Course, Engine, Moved
+from scene_envs.physics.mujoco import MujocoEngine
 from scene_envs.physics.parts import GRAVITY, LibraryGeometry, library_geometry
 from scene_envs.physics.placement import Budget, ObjectPairs, Objects, object_boxes, place
 from scene_envs.physics.statics import Rest, Statics, Support, clusters, company
@@ -27,6 +28,17 @@ _SEGMENT = 0.25
 """Length (s) of a segment; after each, settling chooses the shapes again and checks whether anything still moves."""
 _STILL, _STILL_ANGLE = 5e-5, 5e-4
 """An object that moved less than this (m, rad) in a segment has come to rest."""
+
+
+def make_engine(name: str, library: LibraryGeometry) -> Engine:
+    """The engine ``name`` for clusters of the assets of ``library``; that of Warp, which simulates whole batches, is
+    MuJoCo here.
+    """
+    if name == "bullet":
+        from scene_envs.physics.bullet import BulletEngine
+
+        return BulletEngine(library)
+    return MujocoEngine(library)
 
 
 class Physics:

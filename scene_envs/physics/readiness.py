@@ -117,12 +117,6 @@ def make_ready(
     return ReadyResult(final, ready, ready.sum(dim=-1), finished, best.valid)
 
 
-def _keep(batch: SceneBatch, kept: Tensor) -> SceneBatch:
-    """The scenes with all free objects but ``kept`` (B, N) removed."""
-    categories = batch.categories.masked_fill(batch.is_free & ~kept, batch.scene_type.num_assets)
-    return SceneBatch.from_parts(batch.translations, batch.rotations, categories, batch.scene_type)
-
-
 @dataclass(frozen=True, eq=False)
 class _Round:
     """Scenes after one round of :func:`make_ready`."""
@@ -181,7 +175,7 @@ def _strike(
     ready = ready.clone()
     scenes = ready.any(dim=-1).nonzero()[:, 0]
     for trial in trials if len(scenes) else ():
-        ready[scenes] &= _judge(_keep(batch[scenes], ready[scenes]), scenes, trial, units, pool)[0]
+        ready[scenes] &= _judge(batch[scenes].keeping(ready[scenes]), scenes, trial, units, pool)[0]
     return ready
 
 
@@ -195,7 +189,7 @@ def _strike_until_still(batch: SceneBatch, ready: Tensor, units: Tensor, pool: P
     for trial in _LASTING:
         if not len(scenes):
             break
-        feasible, displacement = _judge(_keep(batch[scenes], ready[scenes]), scenes, trial, units, pool)
+        feasible, displacement = _judge(batch[scenes].keeping(ready[scenes]), scenes, trial, units, pool)
         struck = (ready[scenes] & ~feasible).any(dim=-1)
         ready[scenes] &= feasible
         scenes, still = scenes[struck], (displacement < _UNMOVED)[struck]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import logging
 import sys
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.assets import Asset, ConvexPart, import_report, load_library
 from scene_envs.assets.importing import solids as decomposition
+from scene_envs.assets.importing.audit import PartAudit, audit_parts
 from scene_envs.assets.importing.solids import (
     MAX_CORNERS,
     cache_folder,
@@ -223,3 +225,53 @@ def test_corners_near_the_surface_are_drawn_onto_it() -> None:
     points = np.array([[0.03, 0.02, -0.101], [0.099, 0.05, 0.0], [0.101, 0.101, 0.101], [0.0, 0.0, 0.0]])
     snapped = snap_to_surface(points, cube, 0.003)
     assert snapped == pytest.approx(np.array([[0.03, 0.02, -0.1], [0.1, 0.05, 0.0], [0.1, 0.1, 0.1], [0.0, 0.0, 0.0]]))
+
+
+def audited(folder: Path, visual: trimesh.Trimesh, *parts: trimesh.Trimesh) -> PartAudit:
+    """The audit of an asset with this mesh and the hulls of these parts."""
+    asset = load(folder, trimesh.creation.box((0.1, 0.1, 0.1)))
+    fine = tuple(ConvexPart(np.array(p.convex_hull.vertices), np.array(p.convex_hull.faces)) for p in parts)
+    audit = audit_parts(dataclasses.replace(asset, visual=visual, fine=fine))
+    assert audit is not None
+    return audit
+
+
+def u_shape() -> list[trimesh.Trimesh]:
+    """A U of three boxes, 0.3 wide, 0.1 deep and 0.12 high, 0.02 thick."""
+    sizes = [
+        ((0.3, 0.1, 0.02), (0, 0, 0.01)),
+        ((0.02, 0.1, 0.1), (-0.14, 0, 0.07)),
+        ((0.02, 0.1, 0.1), (0.14, 0, 0.07)),
+    ]
+    return [trimesh.creation.box(size).apply_translation(place) for size, place in sizes]
+
+
+def test_the_audit_of_a_hull_that_fills_a_hollow(tmp_path: Path) -> None:
+    """Three openings of 0.26 x 0.1 m of a box of 0.156 m^2, at most 0.1 m above the floor of the U. A strip of 1 mm
+    along the edges of the mesh counts as contact.
+    """
+    whole = trimesh.util.concatenate(u_shape())
+    audit = audited(tmp_path, whole, whole)
+    share = (0.258 * 0.1 + 2 * 0.258 * 0.099) / 0.156
+    assert audit.parts_alone == pytest.approx(share, abs=3 * (share * (1 - share) / 256) ** 0.5)
+    assert audit.parts_gap == pytest.approx(0.1, abs=1e-5)
+    assert (audit.mesh_alone, audit.mesh_gap) == pytest.approx((0.0, 0.0), abs=1e-5)
+    assert audited(tmp_path, whole, whole) == audit
+
+
+def test_the_audit_of_exact_parts_is_zero(tmp_path: Path) -> None:
+    mesh = trimesh.util.concatenate(u_shape())
+    assert audited(tmp_path, mesh, *u_shape()) == pytest.approx((0.0,) * 4, abs=1e-5)
+    report = import_report(tmp_path)
+    assert report["thing"].audit == pytest.approx((0.0,) * 4, abs=1e-5)
+    assert "0% of the contacts with its parts miss the mesh" in str(report)
+
+
+def test_the_audit_of_parts_that_are_too_small_or_too_large(tmp_path: Path) -> None:
+    """Cubes of 8 and 10 cm about the same middle: gaps of 1 cm, and 1 cm times the root of 3 at corners."""
+    small, large = (trimesh.creation.box((side,) * 3) for side in (0.08, 0.1))
+    inside, outside = audited(tmp_path, large, small), audited(tmp_path, small, large)
+    assert (inside.parts_alone, inside.parts_gap, inside.mesh_alone) == (0.0, 0.0, 1.0)
+    assert (outside.parts_alone, outside.mesh_alone, outside.mesh_gap) == pytest.approx((1.0, 0.0, 0.0), abs=1e-5)
+    for gap in (inside.mesh_gap, outside.parts_gap):
+        assert 0.01 < gap < 0.01 * 3**0.5

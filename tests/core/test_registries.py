@@ -109,3 +109,13 @@ def test_rewards_are_listed_beside_one_that_crashes_or_hangs_the_interpreter(ins
     assert "tidy: Objects per scene." in printed
     assert "tidier: Objects per scene." in printed
     assert "object_count: " in printed
+
+
+def test_a_package_that_is_installed_meanwhile_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert "late" not in plugin_entry_points("scene_envs.rewards")
+    about = tmp_path / "late-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: late\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[scene_envs.rewards]\nlate = late:reward\n")
+    assert plugin_entry_points("scene_envs.rewards")["late"].value == "late:reward"

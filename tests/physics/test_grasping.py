@@ -10,9 +10,9 @@ import torch
 from fcl import Transform
 from scipy.spatial.transform import Rotation
 
+from scene_envs.assets.fcl import Broadphase, Shapes, convex
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
-from scene_envs.physics.fcl import Broadphase, Shapes, convex
 from scene_envs.physics.grasping import TOUCHING, Gripper, reachable
 from scene_envs.physics.mujoco import Overlaps
 from scene_envs.scene import SceneBatch

@@ -167,7 +167,8 @@ def test_the_band_of_a_share_ends_at_one(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_a_reward_that_learns_is_measured_as_the_run_left_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learned_rewards, "FIRST_STEPS", 5)
-    config = small_config(tmp_path, iterations=1, reward="discriminator", algorithm={"name": "nft"})
+    judge = {"name": "discriminator", "steps": 3, "batch_size": 12}
+    config = small_config(tmp_path, iterations=1, reward=judge, algorithm={"name": "nft"})
     prior = tiny_prior(process="mixed", slots=6)
     post_train(config, prior=prior)
     reward, batch = make_reward("discriminator"), prior.sample(3, num_steps=4)

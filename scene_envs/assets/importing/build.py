@@ -40,6 +40,8 @@ from scene_envs.errors import CorruptFileError, InvalidInputError
 if TYPE_CHECKING:
     import trimesh
 
+    from scene_envs.assets.importing.audit import PartAudit
+
 
 YAML_NAMES = ("library.yaml", "library.yml")
 SUFFIXES = (".urdf", ".sdf", *MESH_SUFFIXES)
@@ -270,6 +272,7 @@ class AssetReport:
         notes: Assumptions and choices.
         warnings: Faults of the file, corrected where possible.
         error: Reason why there is no asset; empty when there is one.
+        audit: Comparison of the drawn mesh with the convex parts; None for a mesh of more than 100,000 triangles.
     """
 
     name: str
@@ -281,13 +284,15 @@ class AssetReport:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     error: str = ""
+    audit: PartAudit | None = None
 
     def __str__(self) -> str:
         if self.error:
             return f"{self.name}: not imported: {self.error}"
         weight = f"{self.mass:.4g} kg" if self.mass > 0 else "welded"
         pieces = f"{self.parts} convex part{'s' if self.parts != 1 else ''}"
-        return "; ".join([f"{self.name}: {self.file.name}, {weight}, {pieces}", *self.warnings, *self.notes])
+        compared = () if self.audit is None else (str(self.audit),)
+        return "; ".join([f"{self.name}: {self.file.name}, {weight}, {pieces}", *self.warnings, *self.notes, *compared])
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
@@ -69,15 +69,19 @@ def load_library(folder: str | os.PathLike[str]) -> AssetLibrary:
 
 
 def import_report(folder: str | os.PathLike[str]) -> ImportReport:
-    """Report on the import of a folder: choices, corrections, unreadable files; ``str`` gives a line per asset.
+    """Report on the import of a folder: choices, corrections, how well the convex parts fit the mesh, unreadable files;
+    ``str`` gives a line per asset.
 
     Raises as :func:`load_library` does for the folder and its YAML; files that cannot be read are in the report.
     """
+    from scene_envs.assets.importing.audit import audit_parts
+
     index = folder_index(folder)
     reports = []
     for entry in index.entries:
         try:
-            reports.append(index.build(entry)[1])
+            asset, report = index.build(entry)
+            reports.append(replace(report, audit=audit_parts(asset)))
         except SceneEnvsError as error:
             reports.append(AssetReport(entry.name, index.folder / entry.file, error=str(error)))
     return ImportReport(index.folder, tuple(reports), index.notes)
