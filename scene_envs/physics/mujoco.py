@@ -179,6 +179,7 @@ class _Stage:
         model, count = self.model, len(mass)
         model.body_mass[1 : 1 + count] = model.body_subtreemass[1 : 1 + count] = mass
         model.body_inertia[1 : 1 + count] = moments
+        model.dof_M0[: 6 * count] = np.concatenate([np.repeat(mass[:, None], 3, axis=1), moments], axis=1).ravel()
         weights = np.stack([1.0 / mass, (1.0 / moments).mean(axis=1)], axis=1)
         model.body_invweight0[1 : 1 + count] = weights
         model.dof_invweight0[: 6 * count] = np.repeat(weights, 3, axis=1).ravel()
