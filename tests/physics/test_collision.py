@@ -260,7 +260,7 @@ def test_every_kind_of_contact_agrees_with_the_minkowski_difference(pairs: Pairs
     assert (expected > 1e-6).mean() > 0.4
     np.testing.assert_allclose(depths, expected, atol=EXACT, rtol=0)
     assert (np.abs(depths - expected) < 1e-7).mean() > 0.8
-    assert (depths[expected > 1e-6] > 0).all()
+    assert (depths[expected > EXACT] > 0).all()
 
 
 @pytest.mark.slow
