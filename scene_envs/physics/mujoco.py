@@ -54,7 +54,7 @@ _CERTAIN = 3.5e-6
 the depth: the true depth is between the two."""
 _ARENA = 1 << 26
 """Bytes for the contacts of a model."""
-_TOO_MANY = 400_000
+_TOO_MANY = 600_000
 """Pairs of parts of one scene above which overlaps are not measured: they would take more than a second."""
 Sizes = tuple[int, int, int, int]
 """Free bodies, geometries of each, fixed bodies, geometries of each."""
@@ -233,7 +233,10 @@ class Overlaps:
     def __init__(self, parts: Sequence[Array], bodies: Sequence[Sequence[int]]) -> None:
         self._models = _Models(parts, [_Body(ids, np.eye(3), np.zeros(3)) for ids in bodies])
         self._parts = parts
-        self._radius = np.array([max(np.linalg.norm(parts[i], axis=1).max() for i in ids) for ids in bodies])  # (K,) m
+        corners = [np.concatenate([parts[index] for index in ids]) for ids in bodies]
+        self._middle = np.stack([0.5 * (some.min(axis=0) + some.max(axis=0)) for some in corners])  # (K, 3) m
+        spread = zip(corners, self._middle, strict=True)
+        self._radius = np.array([np.linalg.norm(some - middle, axis=1).max() for some, middle in spread])  # (K,) m
         most = max(map(len, parts))
         self._corners = np.stack([np.resize(corners, (most, 3)) for corners in parts])  # (P, V, 3) m
         self._lock = threading.Lock()
@@ -247,7 +250,7 @@ class Overlaps:
         (n,) ones are no pair. None where the pairs are too many.
         """
         fixed = np.zeros(len(kind), dtype=bool) if fixed is None else fixed
-        if self._work(kind, translation, fixed) > _TOO_MANY:
+        if self._work(kind, translation + apply(rotation, self._middle[kind]), fixed) > _TOO_MANY:
             return None
         position = translation + _aside(kind, translation)
         with self._lock:
@@ -261,11 +264,11 @@ class Overlaps:
         body, depth = body[depth > _ROUNDING], depth[depth > _ROUNDING]
         return body.min(axis=1), body.max(axis=1), depth
 
-    def _work(self, kind: Index, translation: Array, fixed: Mask) -> int:
-        """Pairs of parts of bodies whose bounding spheres meet."""
+    def _work(self, kind: Index, middle: Array, fixed: Mask) -> int:
+        """Pairs of parts of bodies whose bounding spheres, about each ``middle`` (n, 3) m, meet."""
         radius, count = self._radius[kind], self._models.count[kind]
         first, second = np.triu_indices(len(kind), k=1)
-        apart = ((translation[first] - translation[second]) ** 2).sum(axis=1)
+        apart = ((middle[first] - middle[second]) ** 2).sum(axis=1)
         meet = (apart < (radius[first] + radius[second]) ** 2) & ~(fixed[first] & fixed[second])
         return int((count[first] * count[second])[meet].sum())
 
