@@ -22,7 +22,7 @@ from scene_envs.physics.placement import (
 )
 
 TOUCHING = 2e-5
-"""Overlap (m) up to which the face-plane bound of coarse parts is taken as the depth, and none is computed exactly."""
+"""Overlap (m) up to which the face-plane bound of coarse parts is taken as the depth; it needs no exact depth."""
 NEAR = 3e-3
 """Object pairs are listed when their boxes are at most this far apart (m)."""
 NEAR_FIXED = 0.06

@@ -47,6 +47,8 @@ _THICKNESS = 1e-7
 _SAME = 1e-6
 """Bodies are moved by up to this (m) in each direction before MuJoCo is asked for their overlaps: it does not notice
 the overlap of two meshes with one centre and parallel faces."""
+_ROUNDING = 1e-9
+"""Overlap (m) that may be a rounding error of bodies that touch."""
 _CERTAIN = 3.5e-6
 """Largest difference (m) of MuJoCo's depth and the width of both parts along its normal at which the width is taken as
 the depth: the true depth is between the two."""
@@ -179,6 +181,7 @@ class _Stage:
         model, count = self.model, len(mass)
         model.body_mass[1 : 1 + count] = model.body_subtreemass[1 : 1 + count] = mass
         model.body_inertia[1 : 1 + count] = moments
+        # MuJoCo copies the mass matrix of a body that moves freely in the frame of its principal axes from here.
         model.dof_M0[: 6 * count] = np.concatenate([np.repeat(mass[:, None], 3, axis=1), moments], axis=1).ravel()
         weights = np.stack([1.0 / mass, (1.0 / moments).mean(axis=1)], axis=1)
         model.body_invweight0[1 : 1 + count] = weights
@@ -217,8 +220,7 @@ class Overlaps:
     """Exact overlaps of bodies, each a set of convex parts, from the corners (V, 3) m of all parts and the numbers of
     the parts of each kind of body; corners inside the hull of a part are ignored.
 
-    A depth is wrong by less than 4 µm, and in nearly all cases by less than 0.1 µm (benchmarks/narrowphase.py). Tens
-    of metres from the origin, about one overlap in twenty thousand is missed.
+    A depth is wrong by less than 4 µm, and in nearly all cases by less than 0.1 µm (benchmarks/narrowphase.py).
 
     >>> cube = np.array([(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
     >>> overlaps = Overlaps([cube], [[0]])
@@ -247,7 +249,7 @@ class Overlaps:
         fixed = np.zeros(len(kind), dtype=bool) if fixed is None else fixed
         if self._work(kind, translation, fixed) > _TOO_MANY:
             return None
-        position = _parted(kind, translation)
+        position = translation + _aside(kind, translation)
         with self._lock:
             stage = self._models.stage(kind, fixed)
             rows = stage.place(kind, fixed, position, np.roll(quaternions(rotation), 1, axis=1))
@@ -256,6 +258,7 @@ class Overlaps:
             return None
         body, part, depth, normal = rows[found[0]], found[1], found[2], found[3]
         depth = self._certain(part, rotation[body], translation[body], depth, normal)
+        body, depth = body[depth > _ROUNDING], depth[depth > _ROUNDING]
         return body.min(axis=1), body.max(axis=1), depth
 
     def _work(self, kind: Index, translation: Array, fixed: Mask) -> int:
@@ -293,19 +296,19 @@ class Overlaps:
         return np.maximum(width, 0.0)  # type: ignore[no-any-return]
 
 
-def _parted(kind: Index, position: Array) -> Array:
-    """``position`` (n, 3) m of bodies of a ``kind`` (n,), each moved by up to ``_SAME`` that depends on the body alone;
-    bodies that coincide are moved apart.
+def _aside(kind: Index, position: Array) -> Array:
+    """(n, 3) m, moves of up to ``_SAME`` that depend on the ``kind`` (n,) and ``position`` (n, 3) m of each body alone,
+    and on its number among bodies that coincide.
     """
-    golden = np.array([0.6180339887, 0.7548776662, 0.8191725134])
+    steps = np.array([0.6180339887, 0.7548776662, 0.8191725134])
     order = np.lexsort((*position.T, kind))
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
-    rank = np.zeros(len(order))  # larger than that of all near bodies before it
+    rank = np.zeros(len(order), dtype=np.int64)  # larger than that of all coinciding bodies before it
     near = cKDTree(position).query_pairs(_SAME, p=np.inf, output_type="ndarray")
-    for one, other in order[np.array(sorted(np.sort(place[near], axis=1).tolist()), dtype=np.int64).reshape(-1, 2)]:
+    for one, other in sorted(np.sort(place[near], axis=1).tolist()):
         rank[other] = max(rank[other], rank[one] + 1)
-    return position + _SAME * np.modf((1.0 + kind + 0.37 * rank)[:, None] * golden + np.abs(1e3 * position))[0]
+    return _SAME * np.modf((1.0 + kind + 0.37 * rank[place])[:, None] * steps + np.abs(1e3 * position))[0]  # type: ignore[no-any-return]
 
 
 class MujocoEngine:
