@@ -142,7 +142,7 @@ def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch], list[str]])
     """Generate until more than ten candidates are judged, in chunks of five at most."""
     judged = 0
 
-    def judge(batch: SceneBatch) -> list[str]:
+    def judge(batch: SceneBatch, physics: str) -> list[str]:
         nonlocal judged
         judged += len(batch)
         if judged > 10:
@@ -159,7 +159,7 @@ def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch], list[str]])
 def _generate_slowly(output: Path) -> None:
     def slowly(batch: SceneBatch) -> list[str]:
         time.sleep(0.05)
-        return judge_scenes(batch)
+        return judge_scenes(batch, physics)
 
     generation.judge_scenes = slowly
     generation._MAX_CHUNK = 4
@@ -197,7 +197,7 @@ def test_what_was_judged_before_a_kill_is_not_judged_again(
     def count(batch: SceneBatch) -> list[str]:
         nonlocal counted
         counted += len(batch)
-        return judge_scenes(batch)
+        return judge_scenes(batch, physics)
 
     monkeypatch.setattr(generation, "judge_scenes", count)
     monkeypatch.setattr(generation, "_MAX_CHUNK", 1)
@@ -293,9 +293,9 @@ def test_slow_grammars_report_scene_by_scene(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(generation, "_CHUNK_SECONDS", 0.0)
     chunks: list[int] = []
 
-    def judge(batch: SceneBatch) -> list[str]:
+    def judge(batch: SceneBatch, physics: str) -> list[str]:
         chunks.append(len(batch))
-        return judge_scenes(batch)
+        return judge_scenes(batch, physics)
 
     monkeypatch.setattr(generation, "judge_scenes", judge)
     generate_cups(tmp_path)

@@ -92,8 +92,11 @@ def check_result(batch: SceneBatch, *, again: bool) -> bool:
     result = project(batch)
     assert result.valid.tolist() == [True]
     assert bool(result.batch.translations.isfinite().all())
-    left = float(penetration(result.batch).depth.max())
-    assert float(result.residual_depth[0]) == pytest.approx(left, abs=1e-5)
+    left = penetration(result.batch)
+    if bool(left.valid):  # else a heap of too many parts to be measured one by one
+        assert float(result.residual_depth[0]) == pytest.approx(float(left.depth.max()), abs=1e-5)
+    else:
+        assert not bool(result.converged)
     assert bool(result.converged[0]) == (float(result.residual_depth[0]) <= projection.TOLERANCE)
     fixed = ~batch.is_free
     assert torch.equal(result.batch.translations[fixed], batch.translations[fixed])
