@@ -129,11 +129,7 @@ def test_same_bits_in_any_order_company_and_process(engine: str, batch: SceneBat
         assert torch.equal(getattr(alone, name)[0], values[2]), name
 
 
-<<<<<<< HEAD
-@pytest.mark.parametrize("name", ["dimsum_table", "living_room_shelf"])
-=======
 @pytest.mark.parametrize("name", ["dimsum_table", "pantry_shelf"])
->>>>>>> h-ptests
 def test_engines_agree_on_scenes_of_grammars(name: str) -> None:
     """With half a millimetre of noise, which leaves some objects in each other and others in the air."""
     scenes = noisy(name, 8, 5, scale=0.0005)
