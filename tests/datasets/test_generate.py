@@ -138,7 +138,7 @@ class _Killed(BaseException):
     """Stands for a killed process."""
 
 
-def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch], list[str]]) -> None:
+def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch, str], list[str]]) -> None:
     """Generate until more than ten candidates are judged, in chunks of five at most."""
     judged = 0
 
@@ -147,7 +147,7 @@ def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch], list[str]])
         judged += len(batch)
         if judged > 10:
             raise _Killed
-        return verdicts(batch)
+        return verdicts(batch, physics)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generation, "judge_scenes", judge)
@@ -194,7 +194,7 @@ def test_what_was_judged_before_a_kill_is_not_judged_again(
     journal.write_text("".join([*lines[:5], *lines[3:], f"{known} penetr"]))  # told twice; killed while it wrote a line
     counted = 0
 
-    def count(batch: SceneBatch) -> list[str]:
+    def count(batch: SceneBatch, physics: str) -> list[str]:
         nonlocal counted
         counted += len(batch)
         return judge_scenes(batch, physics)
