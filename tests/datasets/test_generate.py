@@ -308,7 +308,7 @@ def test_a_grammar_that_was_changed_since_is_judged_anew(tmp_path: Path, monkeyp
     sample = ToyGrammar.sample_array
     with monkeypatch.context() as patch:  # what an earlier grammar made was in order
         patch.setattr(ToyGrammar, "sample_array", lambda self, rng, count: sample(self, rng.spawn(1)[0], count))
-        _generate_and_die(tmp_path, lambda batch: ["kept"] * len(batch))
+        _generate_and_die(tmp_path, lambda batch, physics: ["kept"] * len(batch))
     generate_cups(tmp_path)
     batch = SceneDataset.load(tmp_path).batch()
     assert set(judge_scenes(batch)) == {generation.KEPT}
