@@ -139,6 +139,7 @@ class _Stage:
         self.model = models.compile(sizes)
         self.data = mujoco.MjData(self.model)
         self.model.geom_sameframe[:] = 0
+        self._fields = {name: getattr(self.model, name) for name in (*_GEOMETRY, *_NODE)}  # views of the model's arrays
         self._first, self._root = self.model.body_geomadr.astype(np.int64), self.model.body_bvhadr.astype(np.int64)
         self._idle = np.zeros((sizes[0], 7))
         self._idle[:, 2] = _FAR * (1 + np.arange(sizes[0]))
@@ -155,13 +156,14 @@ class _Stage:
         within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
         target, source = self._first[number][owner] + within, models.first[kind][owner] + within
         for name in _GEOMETRY:
-            getattr(model, name)[target] = models.geometries[name][source]
+            self._fields[name][target] = models.geometries[name][source]
         owner = np.repeat(np.arange(len(kind)), sizes)
         within = np.arange(len(owner)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
         target, source = self._root[number][owner] + within, models.root[kind][owner] + within
         for name in _NODE:
-            getattr(model, name)[target] = models.nodes[name][source]
-        model.bvh_nodeid[target] += np.where(model.bvh_nodeid[target] >= 0, self._first[number][owner], 0)
+            self._fields[name][target] = models.nodes[name][source]
+        leaf = models.nodes["bvh_nodeid"][source] >= 0
+        self._fields["bvh_nodeid"][target[leaf]] += self._first[number][owner[leaf]].astype(np.int32)
         for field in (model.body_geomnum, model.body_contype, model.body_conaffinity):
             field[:] = 0
         model.body_geomnum[number], model.body_bvhnum[number] = counts, sizes
@@ -355,17 +357,16 @@ class MujocoEngine:
             stage.weigh(self._mass[category], self._moments[category])
             model, data = stage.model, stage.data
             model.opt.gravity[:] = gravity(course.tilt)
-            steps = max(1, round(duration / TIME_STEP))
+            steps, velocity = max(1, round(duration / TIME_STEP)), data.qvel.reshape(-1, 6)[:count]
+            limits = np.repeat((_STILL_WAY / duration, _STILL_ANGLE / duration), 3)
             for done in range(0, steps, _LOOK):
                 ahead = min(_LOOK, steps - done)
                 mujoco.mj_step(model, data, ahead)
                 course.budget.spent += ahead * count
-                speed = np.abs(data.qvel.reshape(-1, 6)[:count]) * duration
-                still = (speed[:, :3] < _STILL_WAY).all() and (speed[:, 3:] < _STILL_ANGLE).all()
-                if still or course.budget.is_spent:
+                if course.budget.is_spent or (np.abs(velocity) < limits).all():
                     break
                 if course.settling is not None:
-                    data.qvel *= (1.0 - DAMPING) ** (ahead * TIME_STEP)
+                    velocity *= (1.0 - DAMPING) ** (ahead * TIME_STEP)
             end = data.qpos.reshape(-1, 7)[:count].copy()
             lost = bool(data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number)
         rotation, translation, angle = cluster.rotation.copy(), cluster.translation.copy(), np.zeros(len(order))

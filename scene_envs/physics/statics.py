@@ -10,8 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from scene_envs.arrays import Array, Index, Mask
@@ -366,8 +364,14 @@ def clusters(objects: Objects, low: Array, high: Array) -> Index:
 
 def components(count: int, first: Index, second: Index) -> Index:
     """(count,) number of the connected component of each node, edges given as (P,), (P,)."""
-    graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
-    return connected_components(graph, directed=False)[1].astype(np.int64)  # type: ignore[no-any-return]
+    lowest = np.arange(count)  # number of a node of the same component
+    while True:
+        least = np.minimum(lowest[first], lowest[second])
+        if (least == lowest[first]).all() and (least == lowest[second]).all():
+            return np.unique(lowest, return_inverse=True)[1]  # type: ignore[no-any-return]
+        np.minimum.at(lowest, first, least)
+        np.minimum.at(lowest, second, least)
+        lowest = lowest[lowest]
 
 
 def company(objects: Objects, pairs: ObjectPairs, chosen: Mask) -> Mask:
