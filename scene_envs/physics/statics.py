@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import NEAR, scene_pairs
 from scene_envs.physics.parts import GRAVITY, AssetGeometry, ContactFace, LibraryGeometry, Rows, apply, padded
-from scene_envs.physics.placement import Contacts, ObjectPairs, Objects
+from scene_envs.physics.placement import Contacts, ObjectPairs, Objects, components
 
 _FLAT = 3e-4
 """Tilt (rad) up to which an object counts as upright."""
@@ -360,18 +360,6 @@ def clusters(objects: Objects, low: Array, high: Array) -> Index:
     first, second = rows[first], rows[second]
     near = ((low[first] <= high[second] + _CLEAR) & (low[second] <= high[first] + _CLEAR)).all(axis=1)
     return np.where(objects.fixed, -1, components(len(objects), first[near], second[near]))
-
-
-def components(count: int, first: Index, second: Index) -> Index:
-    """(count,) number of the connected component of each node, edges given as (P,), (P,)."""
-    lowest = np.arange(count)  # number of a node of the same component
-    while True:
-        least = np.minimum(lowest[first], lowest[second])
-        if (least == lowest[first]).all() and (least == lowest[second]).all():
-            return np.unique(lowest, return_inverse=True)[1]  # type: ignore[no-any-return]
-        np.minimum.at(lowest, first, least)
-        np.minimum.at(lowest, second, least)
-        lowest = lowest[lowest]
 
 
 def company(objects: Objects, pairs: ObjectPairs, chosen: Mask) -> Mask:
