@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -24,6 +25,8 @@ _MEETINGS = 4
 """Largest number of simulations of a scene; each after the first repeats objects that met."""
 _REACH = 0.05
 """Fixed objects further than this (m) plus the height of free fall from a cluster are left out of its simulation."""
+_KNOWN = 4096
+"""Simulations of clusters that are remembered: trials of readiness and searches repeat those of objects that stay."""
 _SEGMENT = 0.25
 """Length (s) of a segment; after each, settling chooses the shapes again and checks whether anything still moves."""
 _STILL, _STILL_ANGLE = 5e-5, 5e-4
@@ -50,11 +53,36 @@ class Physics:
         self.collider = Collider(library)
         self.support = Support(library)
         self.statics = Statics(library)
+        self._known: dict[bytes, tuple[Moved, float]] = {}
+        self._lock = threading.Lock()
 
     def rest(self, objects: Objects, pairs: ObjectPairs, duration: float) -> Rest:
         """Objects of some scenes that need no simulation for ``duration`` seconds."""
         contacts = self.collider.contacts(objects, pairs, self.support.differs(objects, pairs))
         return self.statics.at_rest(objects, pairs, contacts, duration)
+
+    def simulate(self, cluster: Objects, fine: Mask, height: Index, duration: float, course: Course) -> Moved:
+        """As the engine's own; a cluster that was simulated alike a short time ago is not simulated again. Its work
+        counts in the budget all the same, so results do not depend on what was simulated before.
+        """
+        facts = cluster.category, cluster.rotation, cluster.translation, cluster.fixed, fine, height
+        setting = np.array([duration, *course.tilt, -1 if course.settling is None else course.settling])
+        key = b"".join(np.ascontiguousarray(values).tobytes() for values in (*facts, setting))
+        with self._lock:
+            moved, spent = self._known.pop(key, (None, 0.0))
+            if moved is not None:
+                self._known[key] = moved, spent  # the last used one is the last
+        if moved is not None and course.budget.spent + spent < course.budget.limit:
+            course.budget.spent += spent
+            return moved
+        before = course.budget.spent
+        moved = self.engine.simulate(cluster, fine, height, duration, course)
+        if not course.budget.is_spent and moved.is_finite:
+            with self._lock:
+                self._known[key] = moved, course.budget.spent - before
+                if len(self._known) > _KNOWN:
+                    del self._known[next(iter(self._known))]
+        return moved
 
 
 _physics = cache(Physics)
@@ -159,7 +187,7 @@ def _simulate(
         close = objects.fixed & (whole[members].any() | ((pairs.low <= high) & (pairs.high >= low)).all(axis=1))
         left_out[np.ix_(members, objects.fixed & ~close)] = True
         rows = np.flatnonzero(members | close)
-        end = physics.engine.simulate(objects[rows], fine[rows], height[rows], duration, course)
+        end = physics.simulate(objects[rows], fine[rows], height[rows], duration, course)
         free = ~objects.fixed[rows]
         moved.rotation[rows[free]], moved.translation[rows[free]] = end.rotation[free], end.translation[free]
         moved.angle[rows[free]] = end.angle[free]
