@@ -13,7 +13,7 @@ from agents.configuration.composition import (
     LoggerSettings,
     OptimizerSettings,
     ProgressKeys,
-    RewardLimits,
+    RewardLimitKeys,
     SamplingKeys,
     TrainingKeys,
     composed,
@@ -353,7 +353,7 @@ class RegularisationSettings:
         return self.weight or 0.0
 
 
-RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "progress", "reward_timeout", "reward_memory")
+RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "progress", "reward_limits")
 """Fields that may change between a run and its continuation."""
 
 
@@ -479,7 +479,7 @@ class BatchKeys:
 
 @composed
 @dataclass
-class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, RewardLimits):
+class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, RewardLimitKeys):
     """One post-training run.
 
     With DDPO-SF, the gradient that AdamW sees is that of
@@ -491,7 +491,8 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
     and the pretraining loss is a mean over scenes and entries. The weight is meaningful only with these reductions.
 
     Keys that are not listed are those of :class:`~agents.configuration.composition.SamplingKeys`,
-    :class:`~agents.configuration.composition.TrainingKeys` and :class:`~agents.configuration.composition.RewardLimits`.
+    :class:`~agents.configuration.composition.TrainingKeys` and
+    :class:`~agents.configuration.composition.RewardLimitKeys`.
 
     Attributes:
         prior: prior from which the run starts: a shipped name or a path.
@@ -539,7 +540,6 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         require_at_least(self, 1, "iterations", "num_steps", "slots")
         require_at_least(self, 0, "seed")
         require_at_least(self, 2, "batch_size")
-        require_positive(self, "reward_timeout", "reward_memory")
         if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
             raise InvalidInputError(
                 f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
@@ -581,8 +581,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         return run_reward(
             self.reward,
             seed=self.seed,
-            timeout=self.reward_timeout,
-            memory=self.reward_memory,
+            **vars(self.reward_limits),
             workers=0 if self.workers == "ray" else self.workers,
             physics=self.physics,
         )

@@ -157,7 +157,7 @@ def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch], list[str]])
 
 
 def _generate_slowly(output: Path) -> None:
-    def slowly(batch: SceneBatch) -> list[str]:
+    def slowly(batch: SceneBatch, physics: str = "auto") -> list[str]:
         time.sleep(0.05)
         return judge_scenes(batch, physics)
 
@@ -194,7 +194,7 @@ def test_what_was_judged_before_a_kill_is_not_judged_again(
     journal.write_text("".join([*lines[:5], *lines[3:], f"{known} penetr"]))  # told twice; killed while it wrote a line
     counted = 0
 
-    def count(batch: SceneBatch) -> list[str]:
+    def count(batch: SceneBatch, physics: str = "auto") -> list[str]:
         nonlocal counted
         counted += len(batch)
         return judge_scenes(batch, physics)
