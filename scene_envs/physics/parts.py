@@ -167,6 +167,10 @@ class LibraryGeometry:
         self.assets = tuple(self._add(asset) for asset in assets)
         self.static = np.array([asset.static or asset.mass <= 0 for asset in assets])
         self.center_of_mass = np.stack([np.asarray(asset.center_of_mass, dtype=np.float64) for asset in assets])
+        self.mass = np.array([asset.mass for asset in assets], dtype=np.float64)
+        principal = [principal_inertia(asset.inertia) for asset in assets]
+        self.moments = np.stack([moments for moments, _ in principal])  # (C, 3) kg m^2
+        self.axes = np.stack([axes for _, axes in principal])  # (C, 3, 3) principal axes of each asset, columns
         fine = [asset.fine.parts for asset in self.assets]
         self.corners = np.array([sum(len(part.vertices) for part in parts) for parts in fine], dtype=np.int64)
         self.directions = np.array([sum(len(part.normals) for part in parts) for parts in fine], dtype=np.int64)

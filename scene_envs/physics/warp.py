@@ -23,7 +23,9 @@ from torch import Tensor
 
 from scene_envs.arrays import Array
 from scene_envs.errors import InvalidInputError, MissingDependencyError
-from scene_envs.physics.parts import FRICTION, GRAVITY, principal_inertia
+from scene_envs.physics.engines import gravity
+from scene_envs.physics.mujoco import SOLIMP, SOLREF, TIMESTEP
+from scene_envs.physics.parts import FRICTION, library_geometry
 from scene_envs.progress import Progress
 from scene_envs.rotations import matrix_to_quaternion, quaternion_to_matrix
 from scene_envs.scene import SceneBatch
@@ -48,10 +50,6 @@ _MODELS = 8
 """Models kept at a time."""
 _CHECK = 10
 """Steps between looks at the counters."""
-TIMESTEP = 0.002
-"""Time step (s) of motion; this and the next two are those of exported MJCF."""
-_SOLREF, _SOLIMP = [0.004, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
-"""Stiffness of contacts."""
 _ASIDE = (4.8e-7, 6.0e-7, 6.4e-7)
 _ASKEW = ((1.0, -1.8e-6, -1.9e-6), (1.8e-6, 1.0, -1.4e-6), (1.9e-6, 1.4e-6, 1.0))
 """The second object of a pair is moved by the first (m), by which depths are corrected, and its parts are turned by the
@@ -268,7 +266,6 @@ class WarpEngine:
             raise InvalidInputError(f"duration={duration} must be a positive number of seconds")
         if not 0 <= damping < 1:
             raise InvalidInputError(f"damping={damping} must be at least 0 and below 1")
-        down = GRAVITY * np.array([*np.sin(tilt), -np.cos(np.hypot(*tilt))])
         with self._scope(), Progress("Simulating", len(batch), style=progress or "none") as shown:
             state = _State(batch, self.device)
             translation, rotation = state.translation.clone(), state.rotation.clone()
@@ -278,7 +275,7 @@ class WarpEngine:
             done = 0
             while open_rows:
                 rows, room = open_rows.pop()
-                moved = self._launch_scenes(plan, rows, room, steps, down, -math.log1p(-damping), shown)
+                moved = self._launch_scenes(plan, rows, room, steps, gravity(tilt), -math.log1p(-damping), shown)
                 if moved is None and len(rows) > 1:
                     open_rows += [(half, room) for half in rows.chunk(2)[::-1]]
                     continue
@@ -299,7 +296,7 @@ class WarpEngine:
         return translation.float(), rotation.float(), valid
 
     def _launch_scenes(
-        self, plan: _Plan, rows: Tensor, room: int, steps: int, gravity: Array, damping: float, shown: Progress
+        self, plan: _Plan, rows: Tensor, room: int, steps: int, down: Array, damping: float, shown: Progress
     ) -> list[Tensor] | None:
         """Asset frames (w, S, 3), (w, S, 3, 3) of the free objects after some steps, whether (w,) they are finite, and
         whether (w,) a scene had more than ``room`` contacts; None where there were too many in all.
@@ -311,7 +308,7 @@ class WarpEngine:
         free = category[:, fixed:]
         library.fill(wp, m, category[:, plan.column], plan.part, most)
         library.fill_bodies(wp, m, free, most, damping)
-        wp.to_torch(m.opt.gravity)[:] = torch.tensor(gravity, dtype=torch.float32, device=self.device)
+        wp.to_torch(m.opt.gravity)[:] = torch.tensor(down, dtype=torch.float32, device=self.device)
         present, free = free >= 0, free.clamp(min=0)
         turn = plan.rotation[rows, fixed:] @ library.axes[free]
         center = plan.translation[rows, fixed:] + _turned(plan.rotation[rows, fixed:], library.center_of_mass[free])
@@ -505,11 +502,9 @@ class _Library:
         self.size = table(host.geom_size, 1, torch.float32)
         self.rbound = table(host.geom_rbound, 1, torch.float32)
         self.aabb = table(host.geom_aabb.reshape(-1, 2, 3), 1, torch.float32)
-        axes = [principal_inertia(asset.inertia) for asset in assets]
-        self.moments = torch.tensor(np.stack([moments for moments, _ in axes]), device=device)
-        self.axes = torch.tensor(np.stack([turn for _, turn in axes]), device=device)  # (C, 3, 3), asset frame
-        self.center_of_mass = torch.tensor(np.stack([asset.center_of_mass for asset in assets]), device=device)
-        self.mass = torch.tensor([asset.mass for asset in assets], dtype=torch.float64, device=device)
+        geometry = library_geometry(assets)
+        masses = geometry.mass, geometry.center_of_mass, geometry.moments, geometry.axes
+        self.mass, self.center_of_mass, self.moments, self.axes = (torch.tensor(x, device=device) for x in masses)
         inverse = self.axes.transpose(1, 2)[:, None]  # the frame of a free body is that of its inertia
         self.inner_position = _turned(inverse, self.position - self.center_of_mass[:, None]).float()
         self.inner_quaternion = matrix_to_quaternion(inverse @ self.rotation).float()
@@ -579,7 +574,7 @@ def _template(mujoco: Any, fixed: int, parts: tuple[int, ...], *, multiple: bool
     for parent, count in ((spec.worldbody, fixed), *zip(bodies, parts, strict=True)):
         for _ in range(count):
             geom = parent.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="any", mass=0.0)
-            geom.friction, geom.solref, geom.solimp = [FRICTION, 0.005, 0.0001], _SOLREF, _SOLIMP
+            geom.friction, geom.solref, geom.solimp = [FRICTION, 0.005, 0.0001], SOLREF, SOLIMP
     return spec.compile()
 
 
