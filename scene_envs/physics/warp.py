@@ -126,29 +126,31 @@ class WarpEngine:
     def overlaps(self, batch: SceneBatch) -> Overlaps:
         """Overlapping object pairs of every scene and their depths; independent of slots and of other scenes."""
         with self._scope():
-            return self._overlaps(batch)
-
-    def _overlaps(self, batch: SceneBatch) -> Overlaps:
-        state = _State(batch, self.device)
-        scene, one, two = self._near(state)
-        feature = [
-            torch.cat([~state.welded[scene, slot, None], state.category[scene, slot, None], state.pose[scene, slot]], 1)
-            for slot in (one, two)
-        ]
-        apart = feature[0] - feature[1]  # welded first, then by category and pose: no matter which slots
-        row = (apart != 0).long().argmax(dim=1, keepdim=True)
-        swap = apart.gather(1, row).squeeze(1) > 0
-        one, two = torch.where(swap, two, one), torch.where(swap, one, two)
-        depth, normal, lost = self._depths(state, scene, one, two)
-        normal = torch.where(swap[:, None], -normal, normal)
-        one, two = torch.where(swap, two, one), torch.where(swap, one, two)
-        valid = state.valid.clone()
-        valid[scene[lost]] = False
-        if missing := int((~valid).sum()):
-            _LOGGER.warning("%d of %d scenes are invalid: a pose is not finite, or one pair of objects has more than "
-                            "%d near pairs of parts", missing, len(batch), _PART_PAIRS[self.device.type])  # fmt: skip
-        kept = (depth > 0) & valid[scene]
-        return Overlaps(scene[kept], one[kept], two[kept], depth[kept], normal[kept].float(), valid)
+            state = _State(batch, self._library)
+            scene, one, two = self._near(state)
+            feature = [
+                torch.cat(
+                    [~state.welded[scene, slot, None], state.category[scene, slot, None], state.pose[scene, slot]], 1
+                )
+                for slot in (one, two)
+            ]
+            apart = feature[0] - feature[1]  # welded first, then by category and pose: no matter which slots
+            row = (apart != 0).long().argmax(dim=1, keepdim=True)
+            swap = apart.gather(1, row).squeeze(1) > 0
+            one, two = torch.where(swap, two, one), torch.where(swap, one, two)
+            depth, normal, lost = self._depths(state, scene, one, two)
+            normal = torch.where(swap[:, None], -normal, normal)
+            one, two = torch.where(swap, two, one), torch.where(swap, one, two)
+            valid = state.valid.clone()
+            valid[scene[lost]] = False
+            if missing := int((~valid).sum()):
+                _LOGGER.warning(
+                    "%d of %d scenes are invalid: a pose is not finite, or one pair of objects has more than "
+                    "%d near pairs of parts",
+                    *(missing, len(batch), _PART_PAIRS[self.device.type]),
+                )
+            kept = (depth > 0) & valid[scene]
+            return Overlaps(scene[kept], one[kept], two[kept], depth[kept], normal[kept].float(), valid)
 
     def _near(self, state: _State) -> tuple[Tensor, Tensor, Tensor]:
         """Scene and slots (P,) of the object pairs whose boxes meet, in order."""
@@ -267,7 +269,7 @@ class WarpEngine:
         if not 0 <= damping < 1:
             raise InvalidInputError(f"damping={damping} must be at least 0 and below 1")
         with self._scope(), Progress("Simulating", len(batch), style=progress or "none") as shown:
-            state = _State(batch, self.device)
+            state = _State(batch, self._library)
             translation, rotation = state.translation.clone(), state.rotation.clone()
             valid, plan = state.valid.clone(), _Plan(state, self._library)
             steps = max(1, round(duration / TIMESTEP))
@@ -416,18 +418,15 @@ def _modules() -> tuple[Any, Any, Any]:
 class _State:
     """Poses of a batch in float64 on the device; scenes with a pose that is not finite count as empty."""
 
-    def __init__(self, batch: SceneBatch, device: torch.device) -> None:
-        tensor = batch.tensor.detach().to(device)
+    def __init__(self, batch: SceneBatch, library: _Library) -> None:
+        tensor = batch.tensor.detach().to(library.parts.device)
         self.valid = tensor.isfinite().all(dim=-1).all(dim=-1)
         self.pose = tensor[..., :12].double()
         self.translation, self.rotation = self.pose[..., :3], self.pose[..., 3:].unflatten(-1, (3, 3))
         categories = tensor[..., 12:].argmax(dim=-1)
         self.present = (categories < batch.scene_type.num_assets) & self.valid[:, None]
         self.category = torch.where(self.present, categories, 0)
-        welded = torch.tensor(batch.scene_type.welded_categories, device=device, dtype=torch.long)
-        static = [c for c, asset in enumerate(batch.scene_type.library) if asset.static or asset.mass <= 0]
-        welded = torch.cat([welded, torch.tensor(static, device=device, dtype=torch.long)])
-        self.welded = torch.isin(self.category, welded) & self.present
+        self.welded = library.welded[self.category] & self.present
 
 
 class _Plan:
@@ -509,6 +508,8 @@ class _Library:
         self.inner_position = _turned(inverse, self.position - self.center_of_mass[:, None]).float()
         self.inner_quaternion = matrix_to_quaternion(inverse @ self.rotation).float()
         self.parts = torch.tensor(counts, device=device)
+        self.welded = torch.tensor(geometry.static, device=device)
+        self.welded[list(scene_type.welded_categories)] = True
         bounds = torch.tensor(np.stack([asset.bounds for asset in assets]), device=device)
         self.center, self.half = bounds.mean(dim=1), (bounds[:, 1] - bounds[:, 0]) / 2 + 1e-6
 
