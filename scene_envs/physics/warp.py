@@ -26,7 +26,6 @@ from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.physics.engines import gravity
 from scene_envs.physics.mujoco import SOLIMP, SOLREF, TIMESTEP
 from scene_envs.physics.parts import FRICTION, library_geometry
-from scene_envs.progress import Progress
 from scene_envs.rotations import matrix_to_quaternion, quaternion_to_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
@@ -246,7 +245,6 @@ class WarpEngine:
         *,
         tilt: tuple[float, float] = (0.0, 0.0),
         damping: float = 0.0,
-        progress: str | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Motion of every scene under gravity; independent of slots.
 
@@ -255,7 +253,6 @@ class WarpEngine:
             duration: Simulated time, s; steps of 2 ms.
             tilt: Angles (x, y), rad, by which gravity is tilted.
             damping: Fraction of velocity that objects lose per second.
-            progress: Style of progress, one of :data:`scene_envs.progress.STYLES`; None shows none.
 
         Returns:
             Translations (B, N, 3) m and rotations (B, N, 3, 3) float32 at the end, and validity (B,) bool: False, and
@@ -268,38 +265,32 @@ class WarpEngine:
             raise InvalidInputError(f"duration={duration} must be a positive number of seconds")
         if not 0 <= damping < 1:
             raise InvalidInputError(f"damping={damping} must be at least 0 and below 1")
-        with self._scope(), Progress("Simulating", len(batch), style=progress or "none") as shown:
+        with self._scope():
             state = _State(batch, self._library)
             translation, rotation = state.translation.clone(), state.rotation.clone()
-            valid, plan = state.valid.clone(), _Plan(state, self._library)
+            valid, plan = torch.zeros_like(state.valid), _Plan(state, self._library)
             steps = max(1, round(duration / TIMESTEP))
             open_rows = [(rows, _ROOM) for rows in _chunks(len(batch), _SCENE_WORLDS[self.device.type], self.device)]
-            done = 0
             while open_rows:
                 rows, room = open_rows.pop()
-                moved = self._launch_scenes(plan, rows, room, steps, gravity(tilt), -math.log1p(-damping), shown)
-                if moved is None and len(rows) > 1:
-                    open_rows += [(half, room) for half in rows.chunk(2)[::-1]]
+                moved = self._launch_scenes(plan, rows, room, steps, gravity(tilt), -math.log1p(-damping))
+                if moved is None:  # one scene that is too much alone stays invalid
+                    open_rows += [(half, room) for half in rows.chunk(2)[::-1] if len(rows) > 1]
                     continue
-                crowded = torch.ones_like(rows, dtype=torch.bool) if moved is None else moved[3]
-                if moved is not None and room < _MOST_ROOM and bool(crowded.any()):
+                center, turn, finite, crowded = moved
+                if room < _MOST_ROOM and bool(crowded.any()):
                     open_rows.append((rows[crowded], 4 * room))
-                    rows, moved, crowded = rows[~crowded], [item[~crowded] for item in moved], crowded[~crowded]
-                done += len(rows)
-                shown.update(done, "", f"simulated {done} of {len(batch)} scenes")
-                valid[rows] &= ~crowded if moved is None else moved[2] & ~crowded
-                if moved is None:
-                    continue
+                valid[rows] = state.valid[rows] & finite & ~crowded
                 row, column = ((plan.category[rows, plan.fixed :] >= 0) & valid[rows, None]).nonzero().unbind(dim=1)
                 scene, slot = rows[row], plan.free[rows[row], column]
-                translation[scene, slot], rotation[scene, slot] = moved[0][row, column], moved[1][row, column]
+                translation[scene, slot], rotation[scene, slot] = center[row, column], turn[row, column]
             if lost := int((state.valid & ~valid).sum()):
                 _LOGGER.warning("%d of %d scenes are invalid: diverged, or more contacts than fit", lost, len(batch))
         return translation.float(), rotation.float(), valid
 
     def _launch_scenes(
-        self, plan: _Plan, rows: Tensor, room: int, steps: int, down: Array, damping: float, shown: Progress
-    ) -> list[Tensor] | None:
+        self, plan: _Plan, rows: Tensor, room: int, steps: int, down: Array, damping: float
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
         """Asset frames (w, S, 3), (w, S, 3, 3) of the free objects after some steps, whether (w,) they are finite, and
         whether (w,) a scene had more than ``room`` contacts; None where there were too many in all.
         """
@@ -329,7 +320,7 @@ class WarpEngine:
             wp.to_torch(data.geom_xmat)[:, : len(column)] = turned.float()
             qpos = wp.to_torch(data.qpos).unflatten(1, (-1, 7))
             qpos[present] = start[present].float()
-            with self._compiling("motion", m.nv, shown=shown):
+            with self._compiling("motion", m.nv):
                 peak, crowded = self._steps(m, data, steps, contacts)
             if peak <= contacts:
                 break
@@ -339,7 +330,7 @@ class WarpEngine:
         end = qpos.double()
         turn = askew.transpose(-1, -2) @ quaternion_to_matrix(end[..., 3:]) @ library.axes[free].transpose(-1, -2)
         center = end[..., :3] - aside - _turned(turn, library.center_of_mass[free])
-        return [center, turn, end.isfinite().all(dim=-1).all(dim=-1), crowded]
+        return center, turn, end.isfinite().all(dim=-1).all(dim=-1), crowded
 
     def _steps(self, m: Any, data: Any, steps: int, contacts: int) -> tuple[int, Tensor]:
         """Advance all worlds: the most part pairs or contacts of a step, and worlds (w,) of too many constraints. Ends
@@ -384,15 +375,12 @@ class WarpEngine:
         return self._models[key]
 
     @contextmanager
-    def _compiling(self, *what: str | int, shown: Progress | None = None) -> Iterator[None]:
+    def _compiling(self, *what: str | int) -> Iterator[None]:
         """Say once per machine that kernels are compiled now."""
         folder = Path(self._wp.config.kernel_cache_dir or ".")
         mark = folder / "-".join(map(str, ("scene_envs", self._mjw.__version__, self.device.type, *what)))
         if not mark.exists():
-            text = "MuJoCo Warp compiles its kernels, once, about a minute"
-            _LOGGER.info("%s; they are kept in %s", text, folder)
-            if shown:
-                shown.update(0, text, text)
+            _LOGGER.info("MuJoCo Warp compiles its kernels, once, about a minute; they are kept in %s", folder)
         yield
         mark.touch()
 
