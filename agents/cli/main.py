@@ -407,17 +407,14 @@ def _check_dataset(key: str, value: Any) -> None:
 
 
 def _check_guidance(settings: Any) -> None:
-    from scene_envs.envs.settings import check_claim_guidance, check_physics_guidance
+    from agents.post_training.settings import check_prompt
+    from scene_envs.envs.settings import check_claim_guidance, check_guidance, check_physics_guidance
 
-    prompt, guidance = getattr(settings, "prompt", None), getattr(settings, "guidance", 0.0)
-    if not math.isfinite(guidance):
-        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
-    if hasattr(settings, "prompt") and (guidance or prompt is not None):
-        from agents.post_training.settings import check_prompt
-
-        check_prompt(prompt, guidance)
+    prompt = getattr(settings, "prompt", "those of real scenes")
+    check_prompt(prompt)
+    check_guidance(prompt, getattr(settings, "guidance", 0.0))
     if strength := getattr(settings, "claim_guidance", 0.0):
-        check_claim_guidance(prompt if hasattr(settings, "prompt") else "those of real scenes", strength)
+        check_claim_guidance(prompt, strength)
     if strength := getattr(settings, "physics_guidance", 0.0):
         check_physics_guidance(strength)
 

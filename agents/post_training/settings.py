@@ -25,7 +25,7 @@ from agents.configuration.composition import (
     require_positive,
 )
 from agents.utils.loggers import LOGGERS
-from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
+from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance, check_guidance
 from scene_envs.errors import InvalidInputError
 from scene_envs.registry import Registry
 
@@ -545,7 +545,8 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
                 f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
             )
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
-        check_prompt(self.prompt, self.guidance)
+        check_prompt(self.prompt)
+        check_guidance(self.prompt, self.guidance)
         check_claim_guidance(self.prompt, self.claim_guidance)
         if self.claim_guidance and isinstance(self.algorithm, DDPOSFSettings):
             raise InvalidInputError(
@@ -595,8 +596,8 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         return {**plain_tree(replace(self, reward="")), "reward": reward_name(self.reward)}
 
 
-def check_prompt(prompt: Any, guidance: float) -> None:
-    """Refuse a prompt that is no text, list of texts, source of prompts or None; refuse guidance without a prompt."""
+def check_prompt(prompt: Any) -> None:
+    """Refuse a prompt that is no text, list of texts, source of prompts or None."""
     texts = [prompt] if isinstance(prompt, str) else prompt
     good = prompt is None or (
         isinstance(texts, list | tuple) and texts and all(isinstance(t, str) and t for t in texts)
@@ -604,12 +605,6 @@ def check_prompt(prompt: Any, guidance: float) -> None:
     if not good:
         raise InvalidInputError(
             f"prompt={prompt!r} must be a text, a list of texts, one of {', '.join(PROMPT_SOURCES)}, or null"
-        )
-    if not math.isfinite(guidance):
-        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
-    if guidance and prompt is None:
-        raise InvalidInputError(
-            f"guidance={guidance:g} strengthens a prompt, and prompt is null; give prompt=, or leave guidance=0"
         )
 
 
