@@ -157,7 +157,7 @@ def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch, str], list[s
 
 
 def _generate_slowly(output: Path) -> None:
-    def slowly(batch: SceneBatch) -> list[str]:
+    def slowly(batch: SceneBatch, physics: str) -> list[str]:
         time.sleep(0.05)
         return judge_scenes(batch, physics)
 
