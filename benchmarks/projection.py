@@ -175,7 +175,7 @@ class SmallProgram:
         return gap - CLEARANCE, jacobian[:, :-1].reshape(len(gap), -1)
 
     def _overlap(self, parts: PlacedParts, a: int, b: int) -> tuple[float, Array]:
-        """Gap (m, negative for an overlap) of two placed parts, and the direction (3,) in which the second leaves it."""
+        """Gap (m, negative for an overlap) of two placed parts, and the direction (3,) that takes the second out."""
         one, other = (self.physics.library.parts[parts.part[i]].vertices @ parts.rotation[i].T for i in (a, b))
         shift = parts.translation[b] - parts.translation[a]
         faces = ConvexHull((one[:, None] - (other + shift)[None]).reshape(-1, 3)).equations
