@@ -169,7 +169,7 @@ def _answer(worker: Process, name: str, message: Any = None, timeout: float = ST
         if not failure.is_late:
             raise RewardError(f"reward {name!r} {failure}") from None
         raise RewardTimeoutError(
-            f"reward {name!r} took longer than reward_timeout={timeout:g} s; its process was ended"
+            f"reward {name!r} took longer than reward_limits.timeout={timeout:g} s; its process was ended"
         ) from None
 
 
@@ -187,11 +187,11 @@ class RewardRunner:
         try:
             return getattr(self, method)(*arguments)
         except MemoryError:
-            raise RewardError("the reward took more memory than reward_memory= allows") from None
+            raise RewardError("the reward took more memory than reward_limits.memory allows") from None
         except SceneEnvsError as error:
             cause = error.__cause__
             lacked = isinstance(cause, RuntimeError) and "allocate memory" in str(cause)
-            hint = "; reward_memory= allows more" if lacked or isinstance(cause, MemoryError) else ""
+            hint = "; reward_limits.memory= allows more" if lacked or isinstance(cause, MemoryError) else ""
             kind = type(error) if type(error) in (InvalidInputError, UnknownNameError) else RewardError
             raise kind(f"{error}{hint}") from None
         except BaseException as error:
@@ -334,7 +334,7 @@ def is_foreign(reward: Any) -> bool:
 
 def check_limits(timeout: float, memory: float) -> None:
     """Refuse limits that are not positive numbers."""
-    for name, value in (("reward_timeout", timeout), ("reward_memory", memory)):
+    for name, value in (("timeout", timeout), ("memory", memory)):
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < float("inf"):
             raise InvalidInputError(f"{name}={value!r} must be a positive number")
 

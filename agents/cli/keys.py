@@ -130,17 +130,17 @@ def _sections(config: type | Any) -> list[tuple[type | dataclasses.Field[Any], l
         *(
             (field, _keys(group, dataclasses.fields(group), f"{field.name}."))
             for field, group in groups
-            if dataclasses.is_dataclass(group) and not isinstance(group, type)
+            if dataclasses.is_dataclass(group) and not field.metadata.get("one_key")
         ),
     ]
 
 
 def _keys(made: Any, fields: Sequence[dataclasses.Field[Any]], prefix: str = "") -> list[KeyHelp]:
-    """The keys among ``fields``; a group inside a group is one key, and the name of a component is none."""
+    """The keys among ``fields``; a mapping or a group inside a group is one, and the name of a component is none."""
     meanings, keys = attribute_meanings(type(made)), []
     for field in fields:
         value, meaning = getattr(made, field.name), meanings.get(field.name, "")
-        if dataclasses.is_dataclass(value) and prefix:
+        if dataclasses.is_dataclass(value) and (prefix or field.metadata.get("one_key")):
             inner = attribute_meanings(type(value))
             meaning = " ".join([f"a mapping: {meaning}", *(f"{name}: {text}" for name, text in inner.items())])
         elif dataclasses.is_dataclass(value) or (prefix and field.name == "name"):

@@ -77,7 +77,6 @@ _MINIMA = {
     "friction": 0,
 }
 """The least that a number may be, where a config's ``LEAST`` does not say otherwise."""
-_POSITIVE = ("reward_timeout", "reward_memory")
 _DEVICE = (
     r"(cpu|cuda|mps|xpu|hpu|mtia|xla|ipu|hip|ve|vulkan|maia|lazy|meta|privateuseone|npu|mlu|musa|mkldnn|opengl|opencl|"
     r"ideep|fpga)(:\d{1,4})?"
@@ -383,9 +382,6 @@ def _check_numbers(settings: Any) -> None:
             may_be_none = any(field.name == key and field.default is None for field in dataclasses.fields(settings))
             null = ", or null" if may_be_none else ""
             raise InvalidInputError(f"{key}={value} must be at least {least}{null}")
-    for key in _POSITIVE:
-        if isinstance(value := getattr(settings, key, None), int | float) and not value > 0:
-            raise InvalidInputError(f"{key}={value} must be more than 0")
     if isinstance(seed := getattr(settings, "seed", 0), int) and not 0 <= seed < 2**63:
         raise InvalidInputError(f"seed={seed} must be from 0 to 2^63 - 1")
 
@@ -411,17 +407,14 @@ def _check_dataset(key: str, value: Any) -> None:
 
 
 def _check_guidance(settings: Any) -> None:
-    from scene_envs.envs.settings import check_claim_guidance, check_physics_guidance
+    from agents.post_training.settings import check_prompt
+    from scene_envs.envs.settings import check_claim_guidance, check_guidance, check_physics_guidance
 
-    prompt, guidance = getattr(settings, "prompt", None), getattr(settings, "guidance", 0.0)
-    if not math.isfinite(guidance):
-        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
-    if hasattr(settings, "prompt") and (guidance or prompt is not None):
-        from agents.post_training.settings import check_prompt
-
-        check_prompt(prompt, guidance)
+    prompt = getattr(settings, "prompt", "those of real scenes")
+    check_prompt(prompt)
+    check_guidance(prompt, getattr(settings, "guidance", 0.0))
     if strength := getattr(settings, "claim_guidance", 0.0):
-        check_claim_guidance(prompt if hasattr(settings, "prompt") else "those of real scenes", strength)
+        check_claim_guidance(prompt, strength)
     if strength := getattr(settings, "physics_guidance", 0.0):
         check_physics_guidance(strength)
 

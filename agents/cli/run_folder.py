@@ -56,8 +56,7 @@ _MAY_DIFFER = (
     "open",
     "progress",
     "recipe",
-    "reward_timeout",
-    "reward_memory",
+    "reward_limits",
 )
 """Keys that may change between a run and its repetition."""
 

@@ -314,6 +314,7 @@ def nested(
     option: str = "",
     kinds: Callable[[str], type] | None = None,
     registered: Callable[[], Iterable[str]] = tuple,
+    one_key: bool = False,
 ) -> Any:
     """A field that is a group of keys, a dataclass.
 
@@ -323,8 +324,9 @@ def nested(
         option: option that is the default.
         kinds: function from the name of a component to the dataclass of its settings; None where all have the same.
         registered: function that lists the registered components; with a mapping, its values are their settings.
+        one_key: whether the keys are listed as one key, a mapping, as those of every group inside a group.
     """
-    metadata = {"folder": folder, "option": option, "kinds": kinds, "registered": registered}
+    metadata = {"folder": folder, "option": option, "kinds": kinds, "registered": registered, "one_key": one_key}
     return dataclasses.field(default_factory=make, metadata=metadata)
 
 
@@ -640,16 +642,31 @@ class DrawKeys(DeviceKeys):
 
 @dataclass
 class RewardLimits:
-    """Limits of a reward from outside this package; it runs in its own process.
+    """Limits of a reward from outside this package.
 
     Attributes:
-        reward_timeout: most seconds that the reward may take for a batch; after that the scenes of the batch are
-            invalid.
-        reward_memory: most memory that the reward may allocate, GiB.
+        timeout: most seconds for a batch, whose scenes are invalid after that, or for the import of a reward.
+        memory: most memory that the reward may allocate, GiB.
     """
 
-    reward_timeout: float = 60.0
-    reward_memory: float = 1.0
+    timeout: float = 60.0
+    memory: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 < value < math.inf:
+                raise InvalidInputError(f"reward_limits.{name}={value} must be a positive number")
+
+
+@dataclass
+class RewardLimitKeys:
+    """Rewards from outside this package.
+
+    Attributes:
+        reward_limits: limits of a reward from outside this package; it runs in its own process.
+    """
+
+    reward_limits: RewardLimits = nested(RewardLimits, one_key=True)
 
 
 @dataclass

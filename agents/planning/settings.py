@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from agents.configuration.composition import SamplingKeys, composed, named, nested
+from agents.configuration.composition import SamplingKeys, composed, named, nested, require_at_least
 from agents.planning.gradient import GradientPlanner
 from agents.planning.ledger import PlannerSettings, list_planners, planner_settings
 from scene_envs.errors import InvalidInputError
@@ -91,14 +91,7 @@ class SearchConfig(BudgetKeys, SamplingKeys):
         return [range(start, min(start + self.side_by_side, count)) for start in starts]
 
     def __post_init__(self) -> None:
-        if self.branching < 1:
-            raise InvalidInputError(f"branching={self.branching}: a state needs at least one inpainting")
-        if self.count is not None and self.count < 1:
-            raise InvalidInputError(f"count={self.count}: give the number of scenes to find, at least 1")
-        if self.side_by_side < 1:
-            raise InvalidInputError(f"side_by_side={self.side_by_side}: at least one search runs at a time")
-        if self.num_steps < 1:
-            raise InvalidInputError(f"num_steps={self.num_steps} must be a whole number of at least 1")
+        require_at_least(self, 1, "branching", "count", "side_by_side", "num_steps")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise InvalidInputError(f"max_seconds={self.max_seconds} must be more than 0, or null for no limit")
         if self.budget < self.branching:

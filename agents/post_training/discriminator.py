@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from agents.evaluation.classifier import RESOLUTION
 from agents.evaluation.set_network import ObjectNetwork, SceneTokens, TypicalPlaces, blurred, scene_tokens
-from agents.utils.seeds import derived_generator, derived_seed
+from agents.utils.checkpoints import derived_generator, derived_seed
 from rewards import RewardContext, RewardOutput, register_reward
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch

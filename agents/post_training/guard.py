@@ -11,8 +11,8 @@ import torch
 from torch import Generator, Tensor
 
 from agents.priors.prior import ScenePrior
+from agents.utils.checkpoints import derived_seed
 from agents.utils.process_group import ProcessGroup
-from agents.utils.seeds import derived_seed
 from scene_envs.envs.scoring import RewardScorer
 from scene_envs.scene import SceneBatch
 

@@ -19,8 +19,8 @@ from agents.post_training.algorithms.base import at_all_steps, final_reward
 from agents.post_training.policy import DenoisingPolicy
 from agents.priors.guidance import Hook
 from agents.priors.prior import ScenePrior
+from agents.utils.checkpoints import derived_seed
 from agents.utils.process_group import ProcessGroup, gather_rows
-from agents.utils.seeds import derived_seed
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.scoring import grammar_prompts

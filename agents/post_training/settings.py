@@ -13,7 +13,7 @@ from agents.configuration.composition import (
     LoggerSettings,
     OptimizerSettings,
     ProgressKeys,
-    RewardLimits,
+    RewardLimitKeys,
     SamplingKeys,
     TrainingKeys,
     composed,
@@ -25,7 +25,7 @@ from agents.configuration.composition import (
     require_positive,
 )
 from agents.utils.loggers import LOGGERS
-from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance
+from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance, check_guidance
 from scene_envs.errors import InvalidInputError
 from scene_envs.registry import Registry
 
@@ -353,7 +353,7 @@ class RegularisationSettings:
         return self.weight or 0.0
 
 
-RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "progress", "reward_timeout", "reward_memory")
+RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "progress", "reward_limits")
 """Fields that may change between a run and its continuation."""
 
 
@@ -479,7 +479,7 @@ class BatchKeys:
 
 @composed
 @dataclass
-class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, RewardLimits):
+class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, RewardLimitKeys):
     """One post-training run.
 
     With DDPO-SF, the gradient that AdamW sees is that of
@@ -491,7 +491,8 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
     and the pretraining loss is a mean over scenes and entries. The weight is meaningful only with these reductions.
 
     Keys that are not listed are those of :class:`~agents.configuration.composition.SamplingKeys`,
-    :class:`~agents.configuration.composition.TrainingKeys` and :class:`~agents.configuration.composition.RewardLimits`.
+    :class:`~agents.configuration.composition.TrainingKeys` and
+    :class:`~agents.configuration.composition.RewardLimitKeys`.
 
     Attributes:
         prior: prior from which the run starts: a shipped name or a path.
@@ -539,13 +540,13 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         require_at_least(self, 1, "iterations", "num_steps", "slots")
         require_at_least(self, 0, "seed")
         require_at_least(self, 2, "batch_size")
-        require_positive(self, "reward_timeout", "reward_memory")
         if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
             raise InvalidInputError(
                 f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
             )
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
-        check_prompt(self.prompt, self.guidance)
+        check_prompt(self.prompt)
+        check_guidance(self.prompt, self.guidance)
         check_claim_guidance(self.prompt, self.claim_guidance)
         if self.claim_guidance and isinstance(self.algorithm, DDPOSFSettings):
             raise InvalidInputError(
@@ -581,8 +582,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         return run_reward(
             self.reward,
             seed=self.seed,
-            timeout=self.reward_timeout,
-            memory=self.reward_memory,
+            **vars(self.reward_limits),
             workers=0 if self.workers == "ray" else self.workers,
             physics=self.physics,
         )
@@ -596,8 +596,8 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         return {**plain_tree(replace(self, reward="")), "reward": reward_name(self.reward)}
 
 
-def check_prompt(prompt: Any, guidance: float) -> None:
-    """Refuse a prompt that is no text, list of texts, source of prompts or None; refuse guidance without a prompt."""
+def check_prompt(prompt: Any) -> None:
+    """Refuse a prompt that is no text, list of texts, source of prompts or None."""
     texts = [prompt] if isinstance(prompt, str) else prompt
     good = prompt is None or (
         isinstance(texts, list | tuple) and texts and all(isinstance(t, str) and t for t in texts)
@@ -605,12 +605,6 @@ def check_prompt(prompt: Any, guidance: float) -> None:
     if not good:
         raise InvalidInputError(
             f"prompt={prompt!r} must be a text, a list of texts, one of {', '.join(PROMPT_SOURCES)}, or null"
-        )
-    if not math.isfinite(guidance):
-        raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
-    if guidance and prompt is None:
-        raise InvalidInputError(
-            f"guidance={guidance:g} strengthens a prompt, and prompt is null; give prompt=, or leave guidance=0"
         )
 
 

@@ -24,11 +24,10 @@ from agents.pretraining.initial_prior import TrainingData, prepare
 from agents.pretraining.optimizers import build_optimizer, learning_rate_at
 from agents.pretraining.settings import WEIGHT_DECAY, PretrainConfig
 from agents.priors.prior import ScenePrior
-from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
+from agents.utils.checkpoints import check_tensors, derived_generator, load_checkpoint, save_checkpoint
 from agents.utils.interrupts import Ending, finishing_steps
 from agents.utils.loggers import RunLogger, make_logger
 from agents.utils.process_group import ProcessGroup, is_first_process
-from agents.utils.seeds import derived_generator
 from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed, write_json, write_text

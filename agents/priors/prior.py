@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
@@ -24,7 +23,7 @@ from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.files import StoredPrior, explained, read_stored, write_stored
 from agents.priors.guidance import Guide, Hook, Watch, guidance_hook, physics_strength
 from scene_envs.datasets.prompts import parse_prompt
-from scene_envs.envs.settings import check_claim_guidance, check_physics_guidance
+from scene_envs.envs.settings import check_claim_guidance, check_guidance, check_physics_guidance
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
@@ -537,8 +536,6 @@ class ScenePrior(nn.Module, ABC):
         self, prompt: Prompt, guidance: float, claim_guidance: float, count: int, slots: int
     ) -> list[str] | None:
         """One prompt per scene, or None for scenes without; raises InvalidInputError as :meth:`inpaint` does."""
-        if not math.isfinite(guidance):
-            raise InvalidInputError(f"guidance={guidance} must be a finite number; 0 follows the prompt as it is")
         check_claim_guidance(prompt, claim_guidance)
         if prompt is None:
             check_guidance(prompt, guidance)
@@ -741,15 +738,6 @@ def merge(batch: SceneBatch, new: SceneBatch, mask: Tensor) -> SceneBatch:
 
 
 # -- prompts ---------------------------------------------------------------------------------------
-
-
-def check_guidance(prompt: object, guidance: float) -> None:
-    """Refuse guidance without a prompt; ``""`` is no prompt."""
-    if guidance and not prompt:
-        raise InvalidInputError(
-            f"guidance={guidance:g} strengthens a prompt, and prompt={prompt!r} asks for none; "
-            "give prompt=, or leave guidance=0"
-        )
 
 
 def no_text(scene_type: SceneType, prompt: str) -> InvalidInputError:

@@ -1,4 +1,7 @@
-"""Checkpoints on disk, written atomically and read without running code in the file."""
+"""Checkpoints on disk, written atomically and read without running code in the file.
+
+Seeds of independent random streams are derived from keys, so that a resumed run needs no state of a generator.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,9 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError
 from scene_envs.files import replacing
@@ -76,3 +80,17 @@ def check_tensors(module: nn.Module, tensors: Mapping[str, Tensor], path: str | 
             f"first {differing[0]!r}; the run began with another prior: go on with that one, or give another output to "
             "start anew"
         )
+
+
+def derived_seed(*key: int) -> int:
+    """A seed below 2^31 that depends on all numbers of ``key``, such as (seed, purpose, iteration); none is negative.
+
+    >>> derived_seed(0, 1) != derived_seed(1, 0)
+    True
+    """
+    return int(np.random.SeedSequence(key).generate_state(1)[0]) >> 1
+
+
+def derived_generator(*key: int) -> Generator:
+    """A CPU generator with a seed below 2^63 that depends on all numbers of ``key``, none of them negative."""
+    return Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0]) >> 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.envs.settings import PROMPT_SOURCES
+from scene_envs.envs.settings import PROMPT_SOURCES, check_guidance
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.protocols import PriorLike, PromptedPriorLike, SceneScorer
 from scene_envs.registry import plugin_entry_points
@@ -182,13 +181,7 @@ class EnvPrompts:
         self._choices: tuple[str, ...] | None = _choices(prompt)
         self.given = prompt is not None
         self._rows: dict[str, Tensor] = {}  # token indices by prompt; each is read once
-        if not math.isfinite(self.guidance):
-            raise InvalidInputError(f"guidance={guidance!r} must be a finite number")
-        if self.guidance and (not self.given or self._choices == ("",)):
-            raise InvalidInputError(
-                f"guidance={self.guidance:g} strengthens a prompt, and prompt={prompt!r} asks for none; "
-                "give prompt=, or leave guidance=0"
-            )
+        check_guidance("" if self._choices == ("",) else prompt, self.guidance)
         if self.given and not prior.conditional:
             raise InvalidInputError(
                 f"prompt={prompt!r}: this prior of {prior.scene_type.name!r} was trained without text; "

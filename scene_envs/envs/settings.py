@@ -60,8 +60,7 @@ class EnvSettings:
         self._require_at_least_one("num_steps")
         if self.slots is not None:
             self._require_at_least_one("slots", _MAX_SLOTS)
-        if not _is_finite(self.guidance):
-            raise InvalidInputError(f"guidance={_shown(self.guidance)} must be a finite number; 0 for none")
+        check_guidance(self.prompt, self.guidance)
 
     def _require_at_least_one(self, name: str, maximum: int = 2**31 - 1) -> None:
         number = getattr(self, name)
@@ -171,6 +170,17 @@ class SearchMaskSettings(TreeSettings):
         super().__post_init__()
         if isinstance(self.masks, str) or not isinstance(self.masks, Sequence) or not self.masks:
             raise InvalidInputError(f"masks={self.masks!r}: give a list of at least one mask, as ['culprits', 'empty']")
+
+
+def check_guidance(prompt: Any, guidance: Any) -> None:
+    """Refuse (InvalidInputError) guidance that is no finite number, or has no prompt; ``""`` is none."""
+    if not _is_finite(guidance):
+        raise InvalidInputError(f"guidance={_shown(guidance)} must be a finite number; 0 follows the prompt as it is")
+    if guidance and not prompt:
+        raise InvalidInputError(
+            f"guidance={guidance:g} strengthens a prompt, and prompt={prompt!r} asks for none; "
+            "give prompt=, or leave guidance=0"
+        )
 
 
 def check_claim_guidance(prompt: Any, strength: Any) -> None:

@@ -10,13 +10,9 @@ import numpy as np
 from scene_envs.assets.base import Asset
 from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, number, numbers, quaternion
 from scene_envs.export.urdf import relative, write_xml
+from scene_envs.physics.mujoco import SOLIMP, SOLREF, TIMESTEP
 from scene_envs.physics.parts import principal_inertia
 from scene_envs.scene_types import Camera
-
-TIMESTEP = 0.002
-"""Time step of the simulation, s."""
-_CONTACT = {"solref": "0.004 1", "solimp": "0.95 0.99 0.001"}
-"""As stiff as the time step allows: objects at rest sink by micrometres, instead of 0.1 mm with MuJoCo's defaults."""
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
@@ -32,8 +28,9 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     visual = ET.SubElement(defaults, "default", {"class": "visual"})
     ET.SubElement(visual, "geom", type="mesh", contype="0", conaffinity="0", group="2", mass="0")
     collision = ET.SubElement(defaults, "default", {"class": "collision"})
-    friction = f"{number(files.friction)} 0.005 0.0001"
-    ET.SubElement(collision, "geom", {"type": "mesh", "group": "3", "mass": "0", "friction": friction, **_CONTACT})
+    contact = {"friction": f"{number(files.friction)} 0.005 0.0001", "solref": numbers(SOLREF)}
+    contact["solimp"] = numbers(SOLIMP[:3])  # the others are MuJoCo's defaults
+    ET.SubElement(collision, "geom", {"type": "mesh", "group": "3", "mass": "0", **contact})
     shared, world = ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody")
     _add_view(root, shared, world, scene.scene_type.camera)
     for asset in scene.assets:

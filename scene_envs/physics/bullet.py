@@ -25,7 +25,6 @@ from scene_envs.physics.parts import (
     apply,
     inset_hull,
     matrices,
-    principal_inertia,
     quaternions,
     times,
 )
@@ -90,9 +89,6 @@ class BodyPool:
         self._bodies: dict[BodyKey, list[int]] = {}
         self._parking: dict[int, tuple[float, float, float]] = {}
         self._wavefronts: dict[BodyKey, str] = {}
-        principal = [principal_inertia(asset.asset.inertia) for asset in library.assets]
-        self._moments = np.array([moments for moments, _ in principal])  # (C, 3) kg m^2
-        self.axes = np.array([axes for _, axes in principal])  # (C, 3, 3) principal axes of each asset, columns
 
     def take(self, needed: Mapping[BodyKey, int]) -> dict[BodyKey, list[int]]:
         """The first ``needed[key]`` parked bodies of each key, whatever calls came before; may raise PhysicsError."""
@@ -120,7 +116,7 @@ class BodyPool:
         bullet.changeDynamics(
             body,
             -1,
-            mass=0.0 if fixed else float(self._library.assets[category].asset.mass),
+            mass=0.0 if fixed else float(self._library.mass[category]),
             localInertiaDiagonal=_ZERO if fixed else self._inertia(category),
             linearDamping=damping,
             angularDamping=damping,
@@ -174,7 +170,7 @@ class BodyPool:
         category, level = key
         if key not in self._wavefronts:
             geometry: LevelGeometry = getattr(self._library.assets[category], level)
-            axes, center = self.axes[category], self._library.center_of_mass[category]
+            axes, center = self._library.axes[category], self._library.center_of_mass[category]
             self._wavefronts[key] = _wavefront(
                 [SCALE * (inset_hull(part, MARGIN) - center) @ axes for part in geometry.parts]
             )
@@ -189,11 +185,11 @@ class BodyPool:
         return shape
 
     def _inertia(self, category: int) -> list[float]:
-        return (SCALE**2 * self._moments[category]).tolist()  # type: ignore[no-any-return]
+        return (SCALE**2 * self._library.moments[category]).tolist()  # type: ignore[no-any-return]
 
     def _body(self, category: int, shape: int, visual: int, place: tuple[float, float, float]) -> int:
         static = bool(self._library.static[category])
-        mass = 0.0 if static else float(self._library.assets[category].asset.mass)
+        mass = 0.0 if static else float(self._library.mass[category])
         body = self.bullet.createMultiBody(
             mass, shape, visual, basePosition=place, useMaximalCoordinates=True, physicsClientId=self.client
         )
@@ -279,7 +275,7 @@ class BulletEngine:
     def _simulate(self, cluster: Objects, fine: Mask, duration: float, course: Course, settings: _Settings) -> Moved:
         bullet, client = self._pool.bullet, self._pool.client
         category, fixed, free = cluster.category, cluster.fixed, np.flatnonzero(~cluster.fixed)
-        axes = self._pool.axes[category]
+        axes = self._library.axes[category]
         center = self._library.center_of_mass[category]
         quaternion = quaternions(times(cluster.rotation, axes))
         position = SCALE * (cluster.translation + apply(cluster.rotation, center))

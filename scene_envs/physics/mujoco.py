@@ -20,16 +20,16 @@ from scene_envs.physics.parts import (
     angle_between,
     apply,
     matrices,
-    principal_inertia,
     quaternions,
     times,
 )
 from scene_envs.physics.placement import Objects, components
 
-TIME_STEP = 0.002
-"""Length of a step, s."""
+TIMESTEP = 0.002
+"""Length of a step, s, also in exported MJCF files."""
 SOLREF, SOLIMP = (0.004, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)
-"""Stiffness of all contacts, that of the exported MJCF files: objects at rest sink by micrometres."""
+"""Stiffness of all contacts, also in exported MJCF files, as large as the step allows: objects at rest sink by
+micrometres, instead of 0.1 mm with MuJoCo's defaults."""
 _LOOK = 12
 """Number of steps between checks for rest."""
 _STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
@@ -95,7 +95,7 @@ class _Models:
         spec = mujoco.MjSpec()
         spec.memory = _ARENA
         option = spec.option
-        option.timestep, option.impratio = TIME_STEP, 10.0
+        option.timestep, option.impratio = TIMESTEP, 10.0
         option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
         for index, corners in enumerate(self._parts):
             spec.add_mesh(name=f"part{index}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL, uservert=corners)
@@ -350,10 +350,6 @@ class MujocoEngine:
 
     def __init__(self, library: LibraryGeometry) -> None:
         self._library = library
-        principal = [principal_inertia(asset.asset.inertia) for asset in library.assets]
-        self._moments = np.array([moments for moments, _ in principal])  # (C, 3) kg m^2
-        self._axes = np.array([axes for _, axes in principal])  # (C, 3, 3) principal axes of each asset, columns
-        self._mass = np.array([float(asset.asset.mass) for asset in library.assets])
         self._lock = threading.Lock()
 
     @cached_property
@@ -361,7 +357,7 @@ class MujocoEngine:
         """Two kinds of body for each asset, of coarse and of fine parts, in the frame of its principal axes."""
         bodies = []
         for category, asset in enumerate(self._library.assets):
-            turn = self._axes[category].T
+            turn = self._library.axes[category].T
             shift = -turn @ self._library.center_of_mass[category]
             bodies += [_Body(level.ids.tolist(), turn, shift) for level in (asset.coarse, asset.fine)]
         return _Models([part.vertices for part in self._library.parts], bodies)
@@ -374,15 +370,15 @@ class MujocoEngine:
         some, category = cluster[order], cluster.category[order[:count]]
         center = self._library.center_of_mass
         position = some.translation + apply(some.rotation, center[some.category])
-        start = quaternions(times(some.rotation, self._axes[some.category]))
+        start = quaternions(times(some.rotation, self._library.axes[some.category]))
         kind = 2 * some.category + fine[order]
         with self._lock:
             stage = self._models.stage(kind, some.fixed)
             stage.place(kind, some.fixed, position, np.roll(start, 1, axis=1))
-            stage.weigh(self._mass[category], self._moments[category])
+            stage.weigh(self._library.mass[category], self._library.moments[category])
             model, data = stage.model, stage.data
             model.opt.gravity[:] = gravity(course.tilt)
-            steps, velocity = max(1, round(duration / TIME_STEP)), data.qvel.reshape(-1, 6)[:count]
+            steps, velocity = max(1, round(duration / TIMESTEP)), data.qvel.reshape(-1, 6)[:count]
             limits = np.repeat((_STILL_WAY / duration, _STILL_ANGLE / duration), 3)
             for done in range(0, steps, _LOOK):
                 ahead = min(_LOOK, steps - done)
@@ -391,12 +387,12 @@ class MujocoEngine:
                 if course.budget.is_spent or (np.abs(velocity) < limits).all():
                     break
                 if course.settling is not None:
-                    velocity *= (1.0 - DAMPING) ** (ahead * TIME_STEP)
+                    velocity *= (1.0 - DAMPING) ** (ahead * TIMESTEP)
             end = data.qpos.reshape(-1, 7)[:count].copy()
             lost = bool(data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number)
         rotation, translation, angle = cluster.rotation.copy(), cluster.translation.copy(), np.zeros(len(order))
         rows, after = order[:count], np.roll(end[:, 3:], -1, axis=1)
-        rotation[rows] = times(matrices(after), self._axes[category].swapaxes(1, 2))
+        rotation[rows] = times(matrices(after), self._library.axes[category].swapaxes(1, 2))
         translation[rows] = np.nan if lost else end[:, :3] - apply(rotation[rows], center[category])
         angle[rows] = angle_between(start[:count], after)
         return Moved(rotation, translation, angle)

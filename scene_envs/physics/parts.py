@@ -77,16 +77,16 @@ def contact_face(fine: Sequence[PartGeometry], coarse: Sequence[PartGeometry], s
     """
     height = side * max(float((side * part.vertices[:, 2]).max()) for part in fine)
     polygons = [polygon for part in fine if (polygon := _flat_corners(part, height)) is not None]
-    outline = _hull2(np.concatenate(polygons)) if polygons else None
+    outline = outline_of(np.concatenate(polygons)) if polygons else None
     coarse_polygons = [polygon for part in coarse if (polygon := _flat_corners(part, height)) is not None]
-    coarse_outline = _hull2(np.concatenate(coarse_polygons)) if coarse_polygons else None
-    if outline is None or coarse_outline is None or abs(_area(outline) - _area(coarse_outline)) > 1e-7:
+    coarse_outline = outline_of(np.concatenate(coarse_polygons)) if coarse_polygons else None
+    if outline is None or coarse_outline is None or abs(area(outline) - area(coarse_outline)) > 1e-7:
         return None
     center = 0.5 * (outline.min(axis=0) + outline.max(axis=0))
     radii = np.linalg.norm(outline - center, axis=1)
     inner = float(-_outside(center[None], outline)[0])
     hole = 0.0
-    if abs(sum(_area(polygon) for polygon in polygons) / _area(outline) - 1.0) > _SAME_AREA:
+    if abs(sum(area(polygon) for polygon in polygons) / area(outline) - 1.0) > _SAME_AREA:
         middles = 0.5 * (outline + np.roll(outline, -1, axis=0))
         gaps = np.stack([_outside(middles, polygon) for polygon in polygons]).min(axis=0)
         if gaps.max() > 1e-4:
@@ -102,17 +102,21 @@ def contact_face(fine: Sequence[PartGeometry], coarse: Sequence[PartGeometry], s
 def _flat_corners(part: PartGeometry, height: float) -> Array | None:
     """Counter-clockwise outline (K, 2) of the part's face at ``height``, or None."""
     points = part.vertices[np.abs(part.vertices[:, 2] - height) < _FACE_TOLERANCE][:, :2]
-    return _hull2(points) if len(points) >= 3 else None
+    return outline_of(points)
 
 
-def _hull2(points: Array) -> Array | None:
+def outline_of(points: Array) -> Array | None:
+    """Counter-clockwise convex outline (K, 2) of points (P, 2); None where they lie on a line."""
+    if len(points) < 3:
+        return None
     try:
         return np.asarray(points[ConvexHull(points).vertices])
     except QhullError:
         return None
 
 
-def _area(polygon: Array) -> float:
+def area(polygon: Array) -> float:
+    """Area of a counter-clockwise polygon (K, 2)."""
     x, y = polygon[:, 0], polygon[:, 1]
     return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
@@ -167,6 +171,10 @@ class LibraryGeometry:
         self.assets = tuple(self._add(asset) for asset in assets)
         self.static = np.array([asset.static or asset.mass <= 0 for asset in assets])
         self.center_of_mass = np.stack([np.asarray(asset.center_of_mass, dtype=np.float64) for asset in assets])
+        self.mass = np.array([asset.mass for asset in assets], dtype=np.float64)
+        principal = [principal_inertia(asset.inertia) for asset in assets]
+        self.moments = np.stack([moments for moments, _ in principal])  # (C, 3) kg m^2
+        self.axes = np.stack([axes for _, axes in principal])  # (C, 3, 3) principal axes of each asset, columns
         fine = [asset.fine.parts for asset in self.assets]
         self.corners = np.array([sum(len(part.vertices) for part in parts) for parts in fine], dtype=np.int64)
         self.directions = np.array([sum(len(part.normals) for part in parts) for parts in fine], dtype=np.int64)
@@ -241,8 +249,8 @@ def library_geometry(assets: tuple[Asset, ...]) -> LibraryGeometry:
 
 
 def apply(rotation: Array, vector: Array) -> Array:
-    """Rotations (n, 3, 3) of vectors (n, 3); written out, so that a row never depends on the others."""
-    r, v = rotation, vector[:, None, :]
+    """Rotations (..., 3, 3) of vectors (..., 3); written out, so that a row never depends on the others."""
+    r, v = rotation, vector[..., None, :]
     return r[..., 0] * v[..., 0] + r[..., 1] * v[..., 1] + r[..., 2] * v[..., 2]  # type: ignore[no-any-return]
 
 

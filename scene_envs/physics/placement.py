@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.parts import SIZE_CLASSES, LevelGeometry, LibraryGeometry, PartTable, Rows
+from scene_envs.physics.parts import SIZE_CLASSES, LevelGeometry, LibraryGeometry, PartTable, Rows, apply, times
 
 _CLASSES = len(SIZE_CLASSES) + 1
 _BLOCK = 1 << 16
@@ -37,12 +37,6 @@ class PlacedParts:
     part: Index  # (I,) index of the part in the library
     rotation: Array  # (I, 3, 3), asset frame to world
     translation: Array  # (I, 3) m, world
-
-
-def rotate(rotation: Array, points: Array) -> Array:
-    """(..., 3, 3) applied to (..., P, 3); written out, so that a row's result never depends on the others."""
-    r, p = rotation[..., None, :, :], points[..., :, None, :]
-    return r[..., 0] * p[..., 0] + r[..., 1] * p[..., 1] + r[..., 2] * p[..., 2]  # type: ignore[no-any-return]
 
 
 def separations(library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index) -> tuple[Array, Array]:
@@ -105,21 +99,21 @@ def _best_face_gap(
     normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
 ) -> tuple[Array, Array]:
     """Best face of the owner: (P,) gap and (P, 3) world normal; ``shift`` leads to the other part."""
-    own = rotation.swapaxes(-1, -2)
-    seen = rotate(rotate(other.swapaxes(-1, -2), own).swapaxes(-1, -2), normals)  # (P, K, 3) in the other's frame
-    away = rotate(other.swapaxes(-1, -2), shift[:, None])[:, 0]
+    inverse = other.swapaxes(-1, -2)
+    seen = apply(times(inverse, rotation)[:, None], normals)  # (P, K, 3) in the other's frame
+    away = apply(inverse, shift)
     gaps = _lowest(seen, vertices) + _along(seen, away) - offsets
     best = gaps.argmax(axis=1)
     rows = np.arange(len(best))
-    return gaps[rows, best], rotate(rotation, normals[rows, best][:, None])[:, 0]
+    return gaps[rows, best], apply(rotation, normals[rows, best])
 
 
 def _face_gaps(
     normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
 ) -> tuple[Array, Array]:
     """Every face of the owner: (P, K) gaps and (P, K, 3) world normals."""
-    world = rotate(rotation, normals)
-    seen = rotate(other.swapaxes(-1, -2), world)
+    world = apply(rotation[:, None], normals)
+    seen = apply(other.swapaxes(-1, -2)[:, None], world)
     return _lowest(seen, vertices) + _along(world, shift) - offsets, world
 
 
@@ -186,7 +180,7 @@ def place(library: LibraryGeometry, objects: Objects, level: Level) -> PlacedObj
         rows = np.flatnonzero(objects.category == category)
         geometry = levels[category]
         target = start[rows][:, None] + np.arange(counts[category])
-        world = rotate(objects.rotation[rows], geometry.vertices[None]) + objects.translation[rows][:, None]
+        world = apply(objects.rotation[rows][:, None], geometry.vertices) + objects.translation[rows][:, None]
         part[target] = geometry.ids
         low[target] = np.minimum.reduceat(world, geometry.starts, axis=1)
         high[target] = np.maximum.reduceat(world, geometry.starts, axis=1)

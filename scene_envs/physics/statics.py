@@ -10,11 +10,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import NEAR, scene_pairs
-from scene_envs.physics.parts import GRAVITY, AssetGeometry, ContactFace, LibraryGeometry, Rows, apply, padded
+from scene_envs.physics.parts import (
+    GRAVITY,
+    AssetGeometry,
+    ContactFace,
+    LibraryGeometry,
+    Rows,
+    apply,
+    area,
+    outline_of,
+    padded,
+)
 from scene_envs.physics.placement import Contacts, ObjectPairs, Objects, components
 
 _FLAT = 3e-4
@@ -83,7 +92,6 @@ class Statics:
 
     def __init__(self, library: LibraryGeometry) -> None:
         self._library = library
-        self._mass = np.array([float(asset.asset.mass) for asset in library.assets])
         self._foot = _Polygons.of([_foot(asset) for asset in library.assets])
         self._surface = _Polygons.of([_surface(part.vertices) for part in library.parts])
         for asset in library.assets:
@@ -141,7 +149,7 @@ class Statics:
 
     def _loaded_center(self, objects: Objects, support: Index, height: Index) -> Array:
         """(n, 2) centre of mass of each object together with everything on it, world frame."""
-        mass = self._mass[objects.category].copy()
+        mass = self._library.mass[objects.category].copy()
         local = self._library.center_of_mass[objects.category]
         moment = mass[:, None] * (objects.translation + apply(objects.rotation, local))[:, :2]
         for level in range(int(height.max(initial=0)), 0, -1):
@@ -239,13 +247,8 @@ def _out_of(objects: Objects, rows: Index, points: Array) -> Array:
 
 def _outline(points: Array) -> Array | None:
     """Counter-clockwise convex outline (K, 2), or None when there is no area."""
-    if len(points) < 3:
-        return None
-    try:
-        hull = ConvexHull(points)
-    except QhullError:
-        return None
-    return np.asarray(points[hull.vertices]) if hull.volume > 1e-7 else None
+    outline = outline_of(points)
+    return outline if outline is not None and area(outline) > 1e-7 else None
 
 
 def _foot(asset: AssetGeometry) -> tuple[float, Array] | None:

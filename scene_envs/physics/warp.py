@@ -23,8 +23,9 @@ from torch import Tensor
 
 from scene_envs.arrays import Array
 from scene_envs.errors import InvalidInputError, MissingDependencyError
-from scene_envs.physics.parts import FRICTION, GRAVITY, principal_inertia
-from scene_envs.progress import Progress
+from scene_envs.physics.engines import gravity
+from scene_envs.physics.mujoco import SOLIMP, SOLREF, TIMESTEP
+from scene_envs.physics.parts import FRICTION, library_geometry
 from scene_envs.rotations import matrix_to_quaternion, quaternion_to_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
@@ -48,10 +49,6 @@ _MODELS = 8
 """Models kept at a time."""
 _CHECK = 10
 """Steps between looks at the counters."""
-TIMESTEP = 0.002
-"""Time step (s) of motion; this and the next two are those of exported MJCF."""
-_SOLREF, _SOLIMP = [0.004, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
-"""Stiffness of contacts."""
 _ASIDE = (4.8e-7, 6.0e-7, 6.4e-7)
 _ASKEW = ((1.0, -1.8e-6, -1.9e-6), (1.8e-6, 1.0, -1.4e-6), (1.9e-6, 1.4e-6, 1.0))
 """The second object of a pair is moved by the first (m), by which depths are corrected, and its parts are turned by the
@@ -128,29 +125,31 @@ class WarpEngine:
     def overlaps(self, batch: SceneBatch) -> Overlaps:
         """Overlapping object pairs of every scene and their depths; independent of slots and of other scenes."""
         with self._scope():
-            return self._overlaps(batch)
-
-    def _overlaps(self, batch: SceneBatch) -> Overlaps:
-        state = _State(batch, self.device)
-        scene, one, two = self._near(state)
-        feature = [
-            torch.cat([~state.welded[scene, slot, None], state.category[scene, slot, None], state.pose[scene, slot]], 1)
-            for slot in (one, two)
-        ]
-        apart = feature[0] - feature[1]  # welded first, then by category and pose: no matter which slots
-        row = (apart != 0).long().argmax(dim=1, keepdim=True)
-        swap = apart.gather(1, row).squeeze(1) > 0
-        one, two = torch.where(swap, two, one), torch.where(swap, one, two)
-        depth, normal, lost = self._depths(state, scene, one, two)
-        normal = torch.where(swap[:, None], -normal, normal)
-        one, two = torch.where(swap, two, one), torch.where(swap, one, two)
-        valid = state.valid.clone()
-        valid[scene[lost]] = False
-        if missing := int((~valid).sum()):
-            _LOGGER.warning("%d of %d scenes are invalid: a pose is not finite, or one pair of objects has more than "
-                            "%d near pairs of parts", missing, len(batch), _PART_PAIRS[self.device.type])  # fmt: skip
-        kept = (depth > 0) & valid[scene]
-        return Overlaps(scene[kept], one[kept], two[kept], depth[kept], normal[kept].float(), valid)
+            state = _State(batch, self._library)
+            scene, one, two = self._near(state)
+            feature = [
+                torch.cat(
+                    [~state.welded[scene, slot, None], state.category[scene, slot, None], state.pose[scene, slot]], 1
+                )
+                for slot in (one, two)
+            ]
+            apart = feature[0] - feature[1]  # welded first, then by category and pose: no matter which slots
+            row = (apart != 0).long().argmax(dim=1, keepdim=True)
+            swap = apart.gather(1, row).squeeze(1) > 0
+            one, two = torch.where(swap, two, one), torch.where(swap, one, two)
+            depth, normal, lost = self._depths(state, scene, one, two)
+            normal = torch.where(swap[:, None], -normal, normal)
+            one, two = torch.where(swap, two, one), torch.where(swap, one, two)
+            valid = state.valid.clone()
+            valid[scene[lost]] = False
+            if missing := int((~valid).sum()):
+                _LOGGER.warning(
+                    "%d of %d scenes are invalid: a pose is not finite, or one pair of objects has more than "
+                    "%d near pairs of parts",
+                    *(missing, len(batch), _PART_PAIRS[self.device.type]),
+                )
+            kept = (depth > 0) & valid[scene]
+            return Overlaps(scene[kept], one[kept], two[kept], depth[kept], normal[kept].float(), valid)
 
     def _near(self, state: _State) -> tuple[Tensor, Tensor, Tensor]:
         """Scene and slots (P,) of the object pairs whose boxes meet, in order."""
@@ -246,7 +245,6 @@ class WarpEngine:
         *,
         tilt: tuple[float, float] = (0.0, 0.0),
         damping: float = 0.0,
-        progress: str | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Motion of every scene under gravity; independent of slots.
 
@@ -255,7 +253,6 @@ class WarpEngine:
             duration: Simulated time, s; steps of 2 ms.
             tilt: Angles (x, y), rad, by which gravity is tilted.
             damping: Fraction of velocity that objects lose per second.
-            progress: Style of progress, one of :data:`scene_envs.progress.STYLES`; None shows none.
 
         Returns:
             Translations (B, N, 3) m and rotations (B, N, 3, 3) float32 at the end, and validity (B,) bool: False, and
@@ -268,39 +265,32 @@ class WarpEngine:
             raise InvalidInputError(f"duration={duration} must be a positive number of seconds")
         if not 0 <= damping < 1:
             raise InvalidInputError(f"damping={damping} must be at least 0 and below 1")
-        down = GRAVITY * np.array([*np.sin(tilt), -np.cos(np.hypot(*tilt))])
-        with self._scope(), Progress("Simulating", len(batch), style=progress or "none") as shown:
-            state = _State(batch, self.device)
+        with self._scope():
+            state = _State(batch, self._library)
             translation, rotation = state.translation.clone(), state.rotation.clone()
-            valid, plan = state.valid.clone(), _Plan(state, self._library)
+            valid, plan = torch.zeros_like(state.valid), _Plan(state, self._library)
             steps = max(1, round(duration / TIMESTEP))
             open_rows = [(rows, _ROOM) for rows in _chunks(len(batch), _SCENE_WORLDS[self.device.type], self.device)]
-            done = 0
             while open_rows:
                 rows, room = open_rows.pop()
-                moved = self._launch_scenes(plan, rows, room, steps, down, -math.log1p(-damping), shown)
-                if moved is None and len(rows) > 1:
-                    open_rows += [(half, room) for half in rows.chunk(2)[::-1]]
+                moved = self._launch_scenes(plan, rows, room, steps, gravity(tilt), -math.log1p(-damping))
+                if moved is None:  # one scene that is too much alone stays invalid
+                    open_rows += [(half, room) for half in rows.chunk(2)[::-1] if len(rows) > 1]
                     continue
-                crowded = torch.ones_like(rows, dtype=torch.bool) if moved is None else moved[3]
-                if moved is not None and room < _MOST_ROOM and bool(crowded.any()):
+                center, turn, finite, crowded = moved
+                if room < _MOST_ROOM and bool(crowded.any()):
                     open_rows.append((rows[crowded], 4 * room))
-                    rows, moved, crowded = rows[~crowded], [item[~crowded] for item in moved], crowded[~crowded]
-                done += len(rows)
-                shown.update(done, "", f"simulated {done} of {len(batch)} scenes")
-                valid[rows] &= ~crowded if moved is None else moved[2] & ~crowded
-                if moved is None:
-                    continue
+                valid[rows] = state.valid[rows] & finite & ~crowded
                 row, column = ((plan.category[rows, plan.fixed :] >= 0) & valid[rows, None]).nonzero().unbind(dim=1)
                 scene, slot = rows[row], plan.free[rows[row], column]
-                translation[scene, slot], rotation[scene, slot] = moved[0][row, column], moved[1][row, column]
+                translation[scene, slot], rotation[scene, slot] = center[row, column], turn[row, column]
             if lost := int((state.valid & ~valid).sum()):
                 _LOGGER.warning("%d of %d scenes are invalid: diverged, or more contacts than fit", lost, len(batch))
         return translation.float(), rotation.float(), valid
 
     def _launch_scenes(
-        self, plan: _Plan, rows: Tensor, room: int, steps: int, gravity: Array, damping: float, shown: Progress
-    ) -> list[Tensor] | None:
+        self, plan: _Plan, rows: Tensor, room: int, steps: int, down: Array, damping: float
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
         """Asset frames (w, S, 3), (w, S, 3, 3) of the free objects after some steps, whether (w,) they are finite, and
         whether (w,) a scene had more than ``room`` contacts; None where there were too many in all.
         """
@@ -311,7 +301,7 @@ class WarpEngine:
         free = category[:, fixed:]
         library.fill(wp, m, category[:, plan.column], plan.part, most)
         library.fill_bodies(wp, m, free, most, damping)
-        wp.to_torch(m.opt.gravity)[:] = torch.tensor(gravity, dtype=torch.float32, device=self.device)
+        wp.to_torch(m.opt.gravity)[:] = torch.tensor(down, dtype=torch.float32, device=self.device)
         present, free = free >= 0, free.clamp(min=0)
         turn = plan.rotation[rows, fixed:] @ library.axes[free]
         center = plan.translation[rows, fixed:] + _turned(plan.rotation[rows, fixed:], library.center_of_mass[free])
@@ -330,7 +320,7 @@ class WarpEngine:
             wp.to_torch(data.geom_xmat)[:, : len(column)] = turned.float()
             qpos = wp.to_torch(data.qpos).unflatten(1, (-1, 7))
             qpos[present] = start[present].float()
-            with self._compiling("motion", m.nv, shown=shown):
+            with self._compiling("motion", m.nv):
                 peak, crowded = self._steps(m, data, steps, contacts)
             if peak <= contacts:
                 break
@@ -340,7 +330,7 @@ class WarpEngine:
         end = qpos.double()
         turn = askew.transpose(-1, -2) @ quaternion_to_matrix(end[..., 3:]) @ library.axes[free].transpose(-1, -2)
         center = end[..., :3] - aside - _turned(turn, library.center_of_mass[free])
-        return [center, turn, end.isfinite().all(dim=-1).all(dim=-1), crowded]
+        return center, turn, end.isfinite().all(dim=-1).all(dim=-1), crowded
 
     def _steps(self, m: Any, data: Any, steps: int, contacts: int) -> tuple[int, Tensor]:
         """Advance all worlds: the most part pairs or contacts of a step, and worlds (w,) of too many constraints. Ends
@@ -385,15 +375,12 @@ class WarpEngine:
         return self._models[key]
 
     @contextmanager
-    def _compiling(self, *what: str | int, shown: Progress | None = None) -> Iterator[None]:
+    def _compiling(self, *what: str | int) -> Iterator[None]:
         """Say once per machine that kernels are compiled now."""
         folder = Path(self._wp.config.kernel_cache_dir or ".")
         mark = folder / "-".join(map(str, ("scene_envs", self._mjw.__version__, self.device.type, *what)))
         if not mark.exists():
-            text = "MuJoCo Warp compiles its kernels, once, about a minute"
-            _LOGGER.info("%s; they are kept in %s", text, folder)
-            if shown:
-                shown.update(0, text, text)
+            _LOGGER.info("MuJoCo Warp compiles its kernels, once, about a minute; they are kept in %s", folder)
         yield
         mark.touch()
 
@@ -419,18 +406,15 @@ def _modules() -> tuple[Any, Any, Any]:
 class _State:
     """Poses of a batch in float64 on the device; scenes with a pose that is not finite count as empty."""
 
-    def __init__(self, batch: SceneBatch, device: torch.device) -> None:
-        tensor = batch.tensor.detach().to(device)
+    def __init__(self, batch: SceneBatch, library: _Library) -> None:
+        tensor = batch.tensor.detach().to(library.parts.device)
         self.valid = tensor.isfinite().all(dim=-1).all(dim=-1)
         self.pose = tensor[..., :12].double()
         self.translation, self.rotation = self.pose[..., :3], self.pose[..., 3:].unflatten(-1, (3, 3))
         categories = tensor[..., 12:].argmax(dim=-1)
         self.present = (categories < batch.scene_type.num_assets) & self.valid[:, None]
         self.category = torch.where(self.present, categories, 0)
-        welded = torch.tensor(batch.scene_type.welded_categories, device=device, dtype=torch.long)
-        static = [c for c, asset in enumerate(batch.scene_type.library) if asset.static or asset.mass <= 0]
-        welded = torch.cat([welded, torch.tensor(static, device=device, dtype=torch.long)])
-        self.welded = torch.isin(self.category, welded) & self.present
+        self.welded = library.welded[self.category] & self.present
 
 
 class _Plan:
@@ -505,15 +489,15 @@ class _Library:
         self.size = table(host.geom_size, 1, torch.float32)
         self.rbound = table(host.geom_rbound, 1, torch.float32)
         self.aabb = table(host.geom_aabb.reshape(-1, 2, 3), 1, torch.float32)
-        axes = [principal_inertia(asset.inertia) for asset in assets]
-        self.moments = torch.tensor(np.stack([moments for moments, _ in axes]), device=device)
-        self.axes = torch.tensor(np.stack([turn for _, turn in axes]), device=device)  # (C, 3, 3), asset frame
-        self.center_of_mass = torch.tensor(np.stack([asset.center_of_mass for asset in assets]), device=device)
-        self.mass = torch.tensor([asset.mass for asset in assets], dtype=torch.float64, device=device)
+        geometry = library_geometry(assets)
+        masses = geometry.mass, geometry.center_of_mass, geometry.moments, geometry.axes
+        self.mass, self.center_of_mass, self.moments, self.axes = (torch.tensor(x, device=device) for x in masses)
         inverse = self.axes.transpose(1, 2)[:, None]  # the frame of a free body is that of its inertia
         self.inner_position = _turned(inverse, self.position - self.center_of_mass[:, None]).float()
         self.inner_quaternion = matrix_to_quaternion(inverse @ self.rotation).float()
         self.parts = torch.tensor(counts, device=device)
+        self.welded = torch.tensor(geometry.static, device=device)
+        self.welded[list(scene_type.welded_categories)] = True
         bounds = torch.tensor(np.stack([asset.bounds for asset in assets]), device=device)
         self.center, self.half = bounds.mean(dim=1), (bounds[:, 1] - bounds[:, 0]) / 2 + 1e-6
 
@@ -579,7 +563,7 @@ def _template(mujoco: Any, fixed: int, parts: tuple[int, ...], *, multiple: bool
     for parent, count in ((spec.worldbody, fixed), *zip(bodies, parts, strict=True)):
         for _ in range(count):
             geom = parent.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="any", mass=0.0)
-            geom.friction, geom.solref, geom.solimp = [FRICTION, 0.005, 0.0001], _SOLREF, _SOLIMP
+            geom.friction, geom.solref, geom.solimp = [FRICTION, 0.005, 0.0001], SOLREF, SOLIMP
     return spec.compile()
 
 

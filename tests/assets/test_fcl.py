@@ -97,4 +97,4 @@ def test_only_calls_that_never_end_the_process_are_made() -> None:
                 if node.attr not in ALLOWED:
                     assert node.attr in ("collide", "distance"), (name, node.lineno)
                     assert [len(called[node].args), called[node].keywords] == [2, []], (name, node.lineno)
-    assert users == {"scene_envs.assets.importing.audit", "scene_envs.assets.fcl", "scene_envs.physics.grasping"}
+    assert users == {"scene_envs.assets.importing.solids", "scene_envs.assets.fcl", "scene_envs.physics.grasping"}

@@ -17,9 +17,10 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.assets import Asset, ConvexPart, import_report, load_library
 from scene_envs.assets.importing import solids as decomposition
-from scene_envs.assets.importing.audit import PartAudit, audit_parts
 from scene_envs.assets.importing.solids import (
     MAX_CORNERS,
+    PartAudit,
+    audit_parts,
     cache_folder,
     enclosing_hull,
     few_cornered_hull,

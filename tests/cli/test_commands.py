@@ -13,7 +13,7 @@ import yaml
 from agents.cli import main
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
-from agents.utils.seeds import derived_seed
+from agents.utils.checkpoints import derived_seed
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from agents.cli import main
-from agents.cli.commands.rewards import RewardsConfig
+from agents.configuration.composition import RewardLimitKeys
 from agents.priors.testing import tiny_prior
 from agents.utils.interrupts import Terminated, finishing_steps, terminable
 from scene_envs.files import claimed
@@ -128,7 +128,7 @@ def test_sigterm_ends_a_command_like_ctrl_c_with_its_own_status(monkeypatch, tmp
         WRITES = False
 
         @staticmethod
-        def run(settings: RewardsConfig):
+        def run(settings: RewardLimitKeys):
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(MAIN, "load_command", lambda name: Told)
@@ -142,7 +142,7 @@ def test_sigterm_during_an_import_that_makes_another_error_of_it_ends_a_command_
     class Told:
         WRITES = False
 
-        def run(settings: RewardsConfig):
+        def run(settings: RewardLimitKeys):
             try:
                 os.kill(os.getpid(), signal.SIGTERM)
             except KeyboardInterrupt:

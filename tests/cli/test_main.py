@@ -291,7 +291,7 @@ LINES = {
     "sample batch_size=0": "batch_size=0 must be at least 1",
     "sample slots=0": "slots=0 must be at least 1, or null",
     "sample eta=nan": "eta=nan must be at least 0",
-    "sample reward_timeout=0": "reward_timeout=0.0 must be more than 0",
+    "sample reward_limits={timeout:0}": "reward_limits.timeout=0.0 must be a positive number",
     "sample guidance=2": "guidance=2 strengthens a prompt",
     "sample claim_guidance=2": "claim_guidance=2 guides scenes to the claims of a prompt",
     "search claim_guidance=2": "give prompt=, or leave claim_guidance=0",

@@ -85,14 +85,34 @@ def test_components_have_a_dozen_settings_at_most() -> None:
 
 
 def shown_keys(config: Any) -> set[str]:
-    """Keys without the names of components; a group inside a group is one key."""
-    keys = {".".join(key.split(".")[:2]) for key in dotted_values(config)}
+    """Keys without the names of components; a mapping and a group inside a group are one key."""
+    mappings = {field.name for field in dataclasses.fields(config) if field.metadata.get("one_key")}
+    keys = {".".join(key.split(".")[: 1 if key.split(".")[0] in mappings else 2]) for key in dotted_values(config)}
     return {key for key in keys if not key.endswith(".name")}
 
 
 @pytest.mark.parametrize(("kind", "most"), [(PostTrainConfig, 40), (PretrainConfig, 45)])
 def test_trainings_have_a_few_dozen_keys(kind: type, most: int) -> None:
     assert len(shown_keys(kind())) + len(["adapter"]) <= most
+
+
+@pytest.mark.parametrize("command", ["sample", "search", "post-train", "check-reward", "rewards"])
+def test_limits_of_a_reward_are_one_mapping(command: str) -> None:
+    def limits(*words: str) -> dict[str, float]:
+        return vars(compose(command, CONFIGS[command], words).reward_limits)
+
+    assert "reward_limits={timeout: 60.0, memory: 1.0}" in help_text(CONFIGS[command])
+    assert limits() == {"timeout": 60.0, "memory": 1.0}
+    assert (
+        limits("reward_limits={timeout:120}")
+        == limits("reward_limits.timeout=120")
+        == {"timeout": 120.0, "memory": 1.0}
+    )
+    assert limits("reward_limits={memory: 2}", "reward_limits.timeout=5") == {"timeout": 5.0, "memory": 2.0}
+    with pytest.raises(UnknownNameError, match=r"reward_limits\.timeot.*did you mean 'reward_limits\.timeout'"):
+        limits("reward_limits={timeot: 120}")
+    with pytest.raises(InvalidInputError, match=r"reward_limits\.memory=-1.0 must be a positive number"):
+        limits("reward_limits.memory=-1")
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -102,10 +102,10 @@ def test_rewards_are_listed_beside_one_that_crashes_or_hangs_the_interpreter(ins
     }
     install("scene_envs.rewards", bodies, {"tidy": "tidy", "tidier": "tidier"})
     assert {"tidy", "segfaults", "holds", "tidier"} <= set(list_rewards())
-    assert main(["rewards", "reward_timeout=3"]) == 0
+    assert main(["rewards", "reward_limits={timeout: 3}"]) == 0
     printed = capsys.readouterr().out
     assert "segfaults: cannot be used. reward 'segfaults' crashed its process (SIGSEGV)" in printed
-    assert "holds: cannot be used. reward 'holds' took longer than reward_timeout=3 s" in printed
+    assert "holds: cannot be used. reward 'holds' took longer than reward_limits.timeout=3 s" in printed
     assert "tidy: Objects per scene." in printed
     assert "tidier: Objects per scene." in printed
     assert "object_count: " in printed

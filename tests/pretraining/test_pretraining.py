@@ -22,7 +22,7 @@ from agents.pretraining.trainer import Pretrainer, learning_rate_at, warm_up_tex
 from agents.priors.mixed import MixedPrior
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
-from agents.utils.seeds import derived_generator
+from agents.utils.checkpoints import derived_generator
 from agents.utils.weight_average import WeightAverage
 from scene_envs.datasets import generate
 from scene_envs.datasets.prompts import describe_all

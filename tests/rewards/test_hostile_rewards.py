@@ -182,8 +182,8 @@ def worker():
     [
         ("leaves", "called sys.exit"),
         ("quits", r"ended its process \(exit status 0\)"),
-        ("hangs", "took longer than reward_timeout=1 s"),
-        ("holds_the_interpreter", "took longer than reward_timeout=1 s"),
+        ("hangs", "took longer than reward_limits.timeout=1 s"),
+        ("holds_the_interpreter", "took longer than reward_limits.timeout=1 s"),
         ("segfaults", r"crashed its process \(SIGSEGV\)"),
         ("fills_memory", "memory"),
         ("talks", "1048576 characters"),
@@ -236,7 +236,7 @@ def test_a_file_that_draws_when_it_is_imported_gives_the_same_in_every_process(c
 @pytest.mark.parametrize(
     ("line", "message"),
     [("import sys; sys.exit(0)", "SystemExit"), ("import os; os._exit(0)", "ended its process"),
-     ("import time; time.sleep(1e6)", "took longer than reward_timeout=4 s")],
+     ("import time; time.sleep(1e6)", "took longer than reward_limits.timeout=4 s")],
 )  # fmt: skip
 def test_a_file_that_exits_or_hangs_when_it_is_imported_is_one_sentence(line, message, tmp_path):
     path = tmp_path / "mine.py"
@@ -251,7 +251,7 @@ def test_a_reward_that_hangs_is_waited_for_once_by_its_check():
 
     def slow(batch):
         calls.append(len(batch))
-        raise RewardTimeoutError("reward 'slow' took longer than reward_timeout=1 s; its process was ended")
+        raise RewardTimeoutError("reward 'slow' took longer than reward_limits.timeout=1 s; its process was ended")
 
     with pytest.raises(RewardError, match="took longer"):
         check_reward(slow)

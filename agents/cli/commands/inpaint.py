@@ -61,10 +61,11 @@ def check(settings: InpaintingConfig) -> None:
 def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[ScenePrior, SceneBatch]:
     """The prior and the scenes that a command works on."""
     if not settings.scenes:
-        from agents.utils.seeds import derived_seed  # with the same noise, a scene would be rearranged into itself
+        from agents.utils.checkpoints import derived_seed
 
         prior, count = load_prior(settings), _FRESH if settings.count is None else settings.count
-        return prior, draw(prior, settings, count, seed=derived_seed(settings.seed, 1))
+        noise = derived_seed(settings.seed, 1)  # with the same noise, a scene would be rearranged into itself
+        return prior, draw(prior, settings, count, seed=noise)
     from scene_envs.datasets import load_scenes
 
     batch = load_scenes(Path(settings.scenes), settings.count)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from agents.cli.commands.export import export_scenes
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior, make_ready, object_counts, reward_figures
 from agents.cli.run_folder import Run
-from agents.configuration.composition import DrawKeys, OutputKeys, SamplingKeys, named, require_one_of
+from agents.configuration.composition import DrawKeys, OutputKeys, RewardLimitKeys, SamplingKeys, named, require_one_of
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class SampleConfig(SamplingKeys, DrawKeys, OutputKeys):
+class SampleConfig(SamplingKeys, DrawKeys, RewardLimitKeys, OutputKeys):
     """Scenes from a prior.
 
     Attributes:
@@ -26,7 +26,6 @@ class SampleConfig(SamplingKeys, DrawKeys, OutputKeys):
         eta: scale of the noise of the Gaussian steps: 1 for the ancestral chain, 0 for a deterministic chain (DDIM).
         union: objects in a scene of a prior of several scene types: one_type (only objects of one type) or any.
         reward: reward that scores the samples for metrics.json; null for none.
-        reward_timeout: most seconds that a reward from outside this package may take; it runs in its own process.
         project: also make the samples simulation-ready (project out of penetration, then settle).
         export: formats of the exported scenes, as drake or [drake, mjcf]; null for none. With project=true the
             simulation-ready scenes are exported. See scene-envs export.
@@ -39,7 +38,6 @@ class SampleConfig(SamplingKeys, DrawKeys, OutputKeys):
     eta: float = 1.0
     union: str = "one_type"
     reward: Any = named("feasible_objects", "reward")
-    reward_timeout: float = 60.0
     project: bool = False
     export: Any = None
 
@@ -68,7 +66,7 @@ def run(settings: SampleConfig, run: Run) -> None:
         reward = run_reward(
             settings.reward,
             seed=settings.seed,
-            timeout=settings.reward_timeout,
+            **vars(settings.reward_limits),
             workers=settings.workers,
             physics=settings.physics,
         )

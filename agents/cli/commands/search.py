@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.run_folder import Run
-from agents.configuration.composition import DeviceKeys, ProgressKeys, RewardLimits, composed, named
+from agents.configuration.composition import DeviceKeys, ProgressKeys, RewardLimitKeys, composed, named
 from agents.planning.settings import SearchConfig
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @composed
 @dataclass
-class SearchKeys(SearchConfig, RewardLimits, DeviceKeys, ProgressKeys):
+class SearchKeys(SearchConfig, RewardLimitKeys, DeviceKeys, ProgressKeys):
     """Inputs and output of a search.
 
     Attributes:
@@ -48,13 +48,16 @@ def run(settings: SearchKeys, run: Run) -> None:
     from scene_envs.datasets import load_scenes
 
     search = SearchConfig(**{field.name: getattr(settings, field.name) for field in fields(SearchConfig)})
-    limits = {"timeout": settings.reward_timeout, "memory": settings.reward_memory}
     scenes = load_scenes(Path(settings.scenes), settings.count) if settings.scenes else None
     prior = settings.prior or ("dimsum_table" if scenes is None else scenes.scene_type.name)
     objective = settings.objective
     if is_foreign(objective):
         objective = run_reward(
-            objective, seed=settings.seed, workers=settings.workers, physics=settings.physics, **limits
+            objective,
+            seed=settings.seed,
+            workers=settings.workers,
+            physics=settings.physics,
+            **vars(settings.reward_limits),
         )
     made = prior if settings.device == "cpu" else ScenePrior.load(prior).to(settings.device)
     with _search_progress(search.nfe_per_scene, settings.progress) as show:

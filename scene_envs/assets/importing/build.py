@@ -28,6 +28,7 @@ from scene_envs.assets.importing.mesh_files import (
 from scene_envs.assets.importing.robot_files import read_sdf, read_urdf
 from scene_envs.assets.importing.solids import (
     Method,
+    PartAudit,
     collision_of,
     enclosing_hull,
     meshes_of,
@@ -39,8 +40,6 @@ from scene_envs.errors import CorruptFileError, InvalidInputError
 
 if TYPE_CHECKING:
     import trimesh
-
-    from scene_envs.assets.importing.audit import PartAudit
 
 
 YAML_NAMES = ("library.yaml", "library.yml")

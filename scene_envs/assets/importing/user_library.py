@@ -33,6 +33,7 @@ from scene_envs.assets.importing.limits import (
     too_slow,
 )
 from scene_envs.assets.importing.mesh_files import Color
+from scene_envs.assets.importing.solids import audit_parts
 from scene_envs.assets.recipes import RECIPES
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.workers import WorkerFailure, run_apart
@@ -74,8 +75,6 @@ def import_report(folder: str | os.PathLike[str]) -> ImportReport:
 
     Raises as :func:`load_library` does for the folder and its YAML; files that cannot be read are in the report.
     """
-    from scene_envs.assets.importing.audit import audit_parts
-
     index = folder_index(folder)
     reports = []
     for entry in index.entries:
