@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.export.formats import _FORMATS, resolve_formats
@@ -17,10 +17,6 @@ from scene_envs.files import write_json
 from scene_envs.physics.parts import FRICTION
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
-
-if TYPE_CHECKING:
-    pass
-
 
 MANIFEST = "export.json"
 

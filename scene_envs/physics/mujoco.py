@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from scene_envs.arrays import Array, Index, Mask
+from scene_envs.arrays import Array, Index, Mask, ranges
 from scene_envs.physics.engines import DAMPING, Course, Moved, gravity
 from scene_envs.physics.parts import (
     FRICTION,
@@ -154,14 +154,11 @@ class _Stage:
         model, models = self.model, self._models
         number = 1 + np.where(fixed, self._free + np.cumsum(fixed), np.cumsum(~fixed)) - 1
         counts, sizes = models.count[kind], models.tree[kind]
-        owner = np.repeat(np.arange(len(kind)), counts)
-        within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-        target, source = self._first[number][owner] + within, models.first[kind][owner] + within
+        target, source = ranges(self._first[number], counts)[1], ranges(models.first[kind], counts)[1]
         for name in _GEOMETRY:
             self._fields[name][target] = models.geometries[name][source]
-        owner = np.repeat(np.arange(len(kind)), sizes)
-        within = np.arange(len(owner)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-        target, source = self._root[number][owner] + within, models.root[kind][owner] + within
+        owner, target = ranges(self._root[number], sizes)
+        source = ranges(models.root[kind], sizes)[1]
         for name in _NODE:
             self._fields[name][target] = models.nodes[name][source]
         leaf = models.nodes["bvh_nodeid"][source] >= 0

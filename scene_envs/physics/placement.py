@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from scene_envs.arrays import Array, Index, Mask
+from scene_envs.arrays import Array, Index, Mask, ranges
 from scene_envs.physics.parts import SIZE_CLASSES, LevelGeometry, LibraryGeometry, PartTable, Rows, apply, times
 
 _CLASSES = len(SIZE_CLASSES) + 1
@@ -201,8 +201,7 @@ def part_pairs(placed: PlacedObjects, first: Index, second: Index) -> tuple[Inde
     two parts (Q,), (Q,) as rows of ``placed.parts``.
     """
     sizes = placed.count[first] * placed.count[second]
-    pair = np.repeat(np.arange(len(first)), sizes)
-    within = np.arange(len(pair)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    pair, within = ranges(np.zeros_like(sizes), sizes)
     columns = placed.count[second][pair]
     return pair, placed.start[first][pair] + within // columns, placed.start[second][pair] + within % columns
 

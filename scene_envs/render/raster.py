@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.arrays import Array, Index
+from scene_envs.arrays import Array, Index, ranges
 from scene_envs.errors import InvalidInputError
 
 _BATCH = 1 << 21
@@ -97,7 +97,7 @@ def visible_triangles(triangles: Array, camera: Pinhole) -> tuple[Index, NDArray
     order = np.argsort(points[..., 1], axis=1)
     points = np.take_along_axis(points, order[..., None], axis=1)  # from the top down
 
-    of, rows = _ranges(first, counts)
+    of, rows = ranges(first, counts)
     spans = _spans(points, of, rows.astype(np.float64) + 0.5)
     begin = np.ceil(np.clip(spans[0], 0, camera.width) - 0.5).astype(np.int64)
     end = np.ceil(np.clip(spans[1], 0, camera.width) - 0.5).astype(np.int64)
@@ -114,7 +114,7 @@ def visible_triangles(triangles: Array, camera: Pinhole) -> tuple[Index, NDArray
         done = total[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(total, done + _BATCH, side="right")))
         part = slice(start, stop)
-        span, columns = _ranges(begin[part], lengths[part])
+        span, columns = ranges(begin[part], lengths[part])
         nearness = (offset[part][span] + slope[part][span] * columns).astype(np.float32)
         # Positive floats are ordered as their bits are: the nearest span has the largest key.
         keys = nearness.view(np.uint32).astype(np.uint64) << np.uint64(32) | (span + start + 1).astype(np.uint64)
@@ -172,12 +172,6 @@ def _leave(inside: Array, outside: Array, near: float) -> Array:
     """The point of the edge between two points (P, 3) that lies in the near plane."""
     share = (inside[:, 2] + near) / (inside[:, 2] - outside[:, 2])
     return inside + share[:, None] * (outside - inside)
-
-
-def _ranges(first: Index, counts: Index) -> tuple[Index, Index]:
-    """All numbers of the ranges ``first[k] ... first[k] + counts[k] - 1``, with the k of each."""
-    of = np.repeat(np.arange(len(counts)), counts)
-    return of, np.arange(len(of)) + (first - (np.cumsum(counts) - counts))[of]
 
 
 def _spans(points: Array, of: Index, y: Array) -> tuple[Array, Array, Array, Array]:
