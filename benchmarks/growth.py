@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from feasibility import forget
 from rich.console import Console
 from rich.table import Table
 
@@ -79,6 +80,7 @@ def main() -> None:
         for name, call in CALLS.items():
             if not found or name != "make_ready":
                 call(scene, physics=options.physics)  # builds what is needed
+            forget(scene, options.physics)
             start = time.process_time()
             call(scene, physics=options.physics)
             spent[name] = time.process_time() - start
