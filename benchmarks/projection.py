@@ -32,12 +32,13 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from scipy.optimize import minimize
+from scipy.spatial import ConvexHull
 
 from scene_envs.assets.shapes import convex_hull
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import project
 from scene_envs.physics.motion import Physics, physics_of
-from scene_envs.physics.placement import Level, Objects, PlacedParts, flatten, part_pairs, place
+from scene_envs.physics.placement import Level, Objects, PlacedParts, flatten, part_pairs, place, separations
 from scene_envs.physics.projection import CLEARANCE, TOLERANCE
 from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
@@ -159,8 +160,9 @@ class SmallProgram:
         translation[self.free] = x.reshape(-1, 3)
         moved = replace(self.objects, translation=translation)
         parts = place(self.physics.library, moved, self.level).parts
-        depth, normal = self.physics.collider.depth(parts, self.a, self.b)
-        gap = -depth
+        gap, normal = separations(self.physics.library, parts, self.a, self.b)
+        for row in np.flatnonzero(gap < 0):  # the bound from face planes is not exact
+            gap[row], normal[row] = self._overlap(parts, self.a[row], self.b[row])
         jacobian = np.zeros((len(gap), len(self.free) + 1, 3))
         for row in np.flatnonzero(gap > 0):  # the gap is at most the distance: two corners may be nearest
             way = self._nearest(parts, self.a[row], self.b[row])
@@ -171,6 +173,14 @@ class SmallProgram:
         jacobian[line, self.column[self.second[self.pair]]] += normal
         jacobian[line, self.column[self.first[self.pair]]] -= normal
         return gap - CLEARANCE, jacobian[:, :-1].reshape(len(gap), -1)
+
+    def _overlap(self, parts: PlacedParts, a: int, b: int) -> tuple[float, Array]:
+        """Gap (m, negative for an overlap) of two placed parts, and the direction (3,) that takes the second out."""
+        one, other = (self.physics.library.parts[parts.part[i]].vertices @ parts.rotation[i].T for i in (a, b))
+        shift = parts.translation[b] - parts.translation[a]
+        faces = ConvexHull((one[:, None] - (other + shift)[None]).reshape(-1, 3)).equations
+        nearest = faces[faces[:, 3].argmax()]
+        return float(nearest[3]), nearest[:3]
 
     def _nearest(self, parts: PlacedParts, a: int, b: int) -> Array:
         """(3,) m: vector from the nearest point of one placed part to that of another, when the two are apart."""

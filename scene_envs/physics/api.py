@@ -40,10 +40,16 @@ def chosen_pool(pool: PhysicsPool | None, physics: str | None) -> PhysicsPool:
 
 
 def run_kernel(
-    kernel: str, batch: SceneBatch, options: dict[str, Any], pool: PhysicsPool, units: Tensor | None = None
+    kernel: str,
+    batch: SceneBatch,
+    options: dict[str, Any],
+    pool: PhysicsPool,
+    units: Tensor | None = None,
+    calm: Tensor | None = None,
 ) -> Rows:
     """Run a kernel of :data:`~scene_envs.physics.kernels.KERNELS`: results of each scene, None where it failed twice.
     ``units`` (B,) float64 may be spent by the simulation of each scene; None derives them from its objects.
+    ``calm`` (B, N) objects stand still while scenes settle, unless others reach them.
     InvalidInputError names scene and slot of a pose that is not finite or a matrix that is no rotation.
     """
     require_rigid_poses(batch)
@@ -53,7 +59,9 @@ def run_kernel(
     workers = max(1, pool.workers)
     size = max(1, min(_CHUNK, -(-len(batch) // workers)))
     limits = None if units is None else units.double().cpu().numpy()
-    whole = Chunk(batch.scene_type, translations, rotations, categories, limits)
+    whole = Chunk(
+        batch.scene_type, translations, rotations, categories, limits, None if calm is None else calm.cpu().numpy()
+    )
     chunks = [whole[start : start + size] for start in range(0, len(batch), size)]
     results = pool.run(kernel, chunks, options)
     if lost := sum(row is not None and not row["valid"] for row in results):
@@ -102,8 +110,9 @@ def poses_after(rows: Rows, batch: SceneBatch) -> tuple[SceneBatch, Tensor, Tens
     present = ~batch.is_empty
     displacement = (translations - batch.translations).norm(dim=-1) * present
     identity = torch.eye(3).expand_as(rotations)
+    turned = (rotations != batch.rotations).any(dim=-1, keepdim=True).any(dim=-2, keepdim=True)
     before = torch.where(present[..., None, None], batch.rotations, identity)
-    after = torch.where(present[..., None, None], project_to_so3(rotations), identity)
+    after = torch.where(present[..., None, None], torch.where(turned, project_to_so3(rotations), rotations), identity)
     return batch.with_poses(translations, after), displacement, geodesic_angle(before, after) * present
 
 

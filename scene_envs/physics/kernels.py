@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_envs.arrays import Array, Index
+from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import TOO_MANY, corner_tests
 from scene_envs.physics.engines import Course
 from scene_envs.physics.motion import Physics, motion, physics_of, settle_scene
@@ -33,13 +33,15 @@ class Chunk:
     rotations: Array  # (b, N, 3, 3) float64
     categories: Index  # (b, N) int64
     units: Array | None = None  # (b,) units of simulation that each scene may spend; None derives them from its objects
+    calm: Mask | None = None  # (b, N) objects that stand still unless others reach them, for settling; None for none
 
     def __len__(self) -> int:
         return len(self.categories)
 
     def __getitem__(self, rows: slice) -> Chunk:
         units = None if self.units is None else self.units[rows]
-        return Chunk(self.scene_type, self.translations[rows], self.rotations[rows], self.categories[rows], units)
+        calm = None if self.calm is None else self.calm[rows]
+        return Chunk(self.scene_type, self.translations[rows], self.rotations[rows], self.categories[rows], units, calm)
 
 
 def _is_heap(physics: Physics, objects: Objects) -> bool:
@@ -206,7 +208,13 @@ def settle_kernel(chunk: Chunk, *, engine: str, duration: float, iterations: int
         pairs = physics.collider.pairs(objects)
         (budget,) = _budgets(row, objects, pairs)
         new_rotation, new_translation, valid[index] = settle_scene(
-            physics, objects, pairs, duration, bottom, Course(budget, settling=iterations)
+            physics,
+            objects,
+            pairs,
+            duration,
+            bottom,
+            Course(budget, settling=iterations),
+            None if row.calm is None else row.calm[0, objects.slot],
         )
         finished[index], spent[index] = not budget.is_spent, budget.spent
         if valid[index]:

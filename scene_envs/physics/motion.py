@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -13,7 +14,7 @@ from scene_envs.physics.collision import Collider
 from scene_envs.physics.engines import Course, Engine, Moved
 from scene_envs.physics.mujoco import MujocoEngine
 from scene_envs.physics.parts import GRAVITY, LibraryGeometry, library_geometry
-from scene_envs.physics.placement import Budget, ObjectPairs, Objects, object_boxes, place
+from scene_envs.physics.placement import Budget, ObjectPairs, Objects, components, object_boxes, place
 from scene_envs.physics.statics import Rest, Statics, Support, clusters, company
 from scene_envs.scene_types import SceneType
 
@@ -24,8 +25,12 @@ _MEETINGS = 4
 """Largest number of simulations of a scene; each after the first repeats objects that met."""
 _REACH = 0.05
 """Fixed objects further than this (m) plus the height of free fall from a cluster are left out of its simulation."""
+_KNOWN = 4096
+"""Simulations of clusters that are remembered: trials of readiness and searches repeat those of objects that stay."""
 _SEGMENT = 0.25
 """Length (s) of a segment; after each, settling chooses the shapes again and checks whether anything still moves."""
+_EXACT = 1e-7
+"""Objects this close (m) to where they rest stay where they are while a scene settles."""
 _STILL, _STILL_ANGLE = 5e-5, 5e-4
 """An object that moved less than this (m, rad) in a segment has come to rest."""
 
@@ -50,11 +55,36 @@ class Physics:
         self.collider = Collider(library)
         self.support = Support(library)
         self.statics = Statics(library)
+        self._known: dict[bytes, tuple[Moved, float]] = {}
+        self._lock = threading.Lock()
 
     def rest(self, objects: Objects, pairs: ObjectPairs, duration: float) -> Rest:
         """Objects of some scenes that need no simulation for ``duration`` seconds."""
         contacts = self.collider.contacts(objects, pairs, self.support.differs(objects, pairs))
         return self.statics.at_rest(objects, pairs, contacts, duration)
+
+    def simulate(self, cluster: Objects, fine: Mask, height: Index, duration: float, course: Course) -> Moved:
+        """As the engine's own; a cluster that was simulated alike a short time ago is not simulated again. Its work
+        counts in the budget all the same, so results do not depend on what was simulated before.
+        """
+        facts = cluster.category, cluster.rotation, cluster.translation, cluster.fixed, fine, height
+        setting = np.array([duration, *course.tilt, -1 if course.settling is None else course.settling])
+        key = b"".join(np.ascontiguousarray(values).tobytes() for values in (*facts, setting))
+        with self._lock:
+            moved, spent = self._known.pop(key, (None, 0.0))
+            if moved is not None:
+                self._known[key] = moved, spent  # the last used one is the last
+        if moved is not None and course.budget.spent + spent < course.budget.limit:
+            course.budget.spent += spent
+            return moved
+        before = course.budget.spent
+        moved = self.engine.simulate(cluster, fine, height, duration, course)
+        if not course.budget.is_spent and moved.is_finite:
+            with self._lock:
+                self._known[key] = moved, course.budget.spent - before
+                if len(self._known) > _KNOWN:
+                    del self._known[next(iter(self._known))]
+        return moved
 
 
 _physics = cache(Physics)
@@ -126,9 +156,21 @@ def advance(
         due = company(objects, pairs, touched)
         due |= np.isin(group, group[due & (group >= 0)])
         whole[due] = whole[due].any()
-        # one cluster for all of these few objects; those that were at rest are at rest again
-        group[due] = int(group.max()) + 1
+        group = _joined(objects, pairs, due, group, first, second)
     return moved
+
+
+def _joined(objects: Objects, pairs: ObjectPairs, due: Mask, group: Index, first: Index, second: Index) -> Index:
+    """``group`` (n,) with new numbers for the clusters of the objects ``due`` (n,): those of one old cluster, pairs
+    that met (Q,), (Q,), and objects near each other are together.
+    """
+    members = np.flatnonzero(due & (group >= 0))
+    _, leading, old = np.unique(group[members], return_index=True, return_inverse=True)
+    near = due[pairs.first] & due[pairs.second]
+    met = due[first] & due[second]
+    one = np.concatenate([members, pairs.first[near], first[met]])
+    other = np.concatenate([members[leading][old], pairs.second[near], second[met]])
+    return np.where(due, components(len(objects), one, other) + int(group.max()) + 1, group)
 
 
 def _simulate(
@@ -159,7 +201,7 @@ def _simulate(
         close = objects.fixed & (whole[members].any() | ((pairs.low <= high) & (pairs.high >= low)).all(axis=1))
         left_out[np.ix_(members, objects.fixed & ~close)] = True
         rows = np.flatnonzero(members | close)
-        end = physics.engine.simulate(objects[rows], fine[rows], height[rows], duration, course)
+        end = physics.simulate(objects[rows], fine[rows], height[rows], duration, course)
         free = ~objects.fixed[rows]
         moved.rotation[rows[free]], moved.translation[rows[free]] = end.rotation[free], end.translation[free]
         moved.angle[rows[free]] = end.angle[free]
@@ -187,14 +229,20 @@ def _meetings(
 
 
 def settle_scene(
-    physics: Physics, objects: Objects, pairs: ObjectPairs, duration: float, bottom: float, course: Course
+    physics: Physics,
+    objects: Objects,
+    pairs: ObjectPairs,
+    duration: float,
+    bottom: float,
+    course: Course,
+    calm: Mask | None = None,
 ) -> tuple[Array, Array, bool]:
     """Let one scene come to rest: rotation (n, 3, 3), translation (n, 3) m, and whether they stayed finite. This takes
     at most ``duration`` seconds. Objects below the height ``bottom`` (m) are simulated no further, and when the budget
-    is spent, all stay at the poses reached.
+    is spent, all stay at the poses reached. Objects that are ``calm`` (n,) stand still unless others reach them.
     """
     current = objects
-    calm = np.zeros(len(objects), dtype=bool)  # was simulated, and did not move
+    calm = np.zeros(len(objects), dtype=bool) if calm is None else calm  # was simulated, and did not move
     remaining = duration
     while remaining > 1e-9 and not course.budget.is_spent:
         span = min(_SEGMENT, remaining)
@@ -203,7 +251,7 @@ def settle_scene(
         active = ~(rest.still | current.fixed)
         fallen = active & (current.translation[:, 2] < bottom)
         done = fallen | active & ~company(current, pairs, active & ~calm & ~fallen)
-        rest = Rest(rest.still | done, rest.rise, rest.tilt)
+        rest = Rest(rest.still | done, np.where(np.abs(rest.rise) < _EXACT, 0.0, rest.rise), rest.tilt)
         if not (active & ~done).any() and (np.abs(rest.rise) < _STILL).all():
             break
         moved = advance(physics, current, pairs, rest, span, course)

@@ -23,7 +23,7 @@ from scene_envs.physics.parts import (
     quaternions,
     times,
 )
-from scene_envs.physics.placement import Objects
+from scene_envs.physics.placement import Objects, components
 
 TIMESTEP = 0.002
 """Length of a step, s, also in exported MJCF files."""
@@ -54,6 +54,8 @@ _CERTAIN = 3.5e-6
 the depth: the true depth is between the two."""
 _ARENA = 1 << 26
 """Bytes for the contacts of a model."""
+_GROUP = 32
+"""Bodies that are asked for their overlaps together: models for many more are slow."""
 _TOO_MANY = 600_000
 """Pairs of parts of one scene above which overlaps are not measured: they would take more than a second."""
 Sizes = tuple[int, int, int, int]
@@ -139,6 +141,7 @@ class _Stage:
         self.model = models.compile(sizes)
         self.data = mujoco.MjData(self.model)
         self.model.geom_sameframe[:] = 0
+        self._fields = {name: getattr(self.model, name) for name in (*_GEOMETRY, *_NODE)}  # views of the model's arrays
         self._first, self._root = self.model.body_geomadr.astype(np.int64), self.model.body_bvhadr.astype(np.int64)
         self._idle = np.zeros((sizes[0], 7))
         self._idle[:, 2] = _FAR * (1 + np.arange(sizes[0]))
@@ -153,12 +156,13 @@ class _Stage:
         counts, sizes = models.count[kind], models.tree[kind]
         target, source = ranges(self._first[number], counts)[1], ranges(models.first[kind], counts)[1]
         for name in _GEOMETRY:
-            getattr(model, name)[target] = models.geometries[name][source]
+            self._fields[name][target] = models.geometries[name][source]
         owner, target = ranges(self._root[number], sizes)
         source = ranges(models.root[kind], sizes)[1]
         for name in _NODE:
-            getattr(model, name)[target] = models.nodes[name][source]
-        model.bvh_nodeid[target] += np.where(model.bvh_nodeid[target] >= 0, self._first[number][owner], 0)
+            self._fields[name][target] = models.nodes[name][source]
+        leaf = models.nodes["bvh_nodeid"][source] >= 0
+        self._fields["bvh_nodeid"][target[leaf]] += self._first[number][owner[leaf]].astype(np.int32)
         for field in (model.body_geomnum, model.body_contype, model.body_conaffinity):
             field[:] = 0
         model.body_geomnum[number], model.body_bvhnum[number] = counts, sizes
@@ -247,27 +251,29 @@ class Overlaps:
         (n,) ones are no pair. None where the pairs are too many.
         """
         fixed = np.zeros(len(kind), dtype=bool) if fixed is None else fixed
-        if self._work(kind, translation + apply(rotation, self._middle[kind]), fixed) > _TOO_MANY:
-            return None
-        position = translation + _aside(kind, translation)
-        with self._lock:
-            stage = self._models.stage(kind, fixed)
-            rows = stage.place(kind, fixed, position, np.roll(quaternions(rotation), 1, axis=1))
-            found = stage.overlaps()
-        if found is None:
-            return None
-        body, part, depth, normal = rows[found[0]], found[1], found[2], found[3]
-        depth = self._certain(part, rotation[body], translation[body], depth, normal)
-        body, depth = body[depth > _ROUNDING], depth[depth > _ROUNDING]
-        return body.min(axis=1), body.max(axis=1), depth
-
-    def _work(self, kind: Index, middle: Array, fixed: Mask) -> int:
-        """Pairs of parts of bodies whose bounding spheres, about each ``middle`` (n, 3) m, meet."""
-        radius, count = self._radius[kind], self._models.count[kind]
+        middle, radius = translation + apply(rotation, self._middle[kind]), self._radius[kind]  # bounding spheres
         first, second = np.triu_indices(len(kind), k=1)
         apart = ((middle[first] - middle[second]) ** 2).sum(axis=1)
-        meet = (apart < (radius[first] + radius[second]) ** 2) & ~(fixed[first] & fixed[second])
-        return int((count[first] * count[second])[meet].sum())
+        near = (apart < (radius[first] + radius[second]) ** 2) & ~(fixed[first] & fixed[second])
+        first, second = first[near], second[near]
+        if (self._models.count[kind[first]] * self._models.count[kind[second]]).sum() > _TOO_MANY:
+            return None
+        position, quaternion = translation + _aside(kind, translation), np.roll(quaternions(rotation), 1, axis=1)
+        bodies: list[Index] = [np.empty((0, 2), dtype=np.int64)]
+        depths: list[Array] = [np.empty(0)]
+        for some in _groups(fixed, first, second):
+            with self._lock:
+                stage = self._models.stage(kind[some], fixed[some])
+                rows = stage.place(kind[some], fixed[some], position[some], quaternion[some])
+                found = stage.overlaps()
+            if found is None:
+                return None
+            body = some[rows[found[0]]]
+            bodies.append(body)
+            depths.append(self._certain(found[1], rotation[body], translation[body], *found[2:]))
+        body, depth = np.concatenate(bodies), np.concatenate(depths)
+        body, depth = body[depth > _ROUNDING], depth[depth > _ROUNDING]
+        return body.min(axis=1), body.max(axis=1), depth
 
     def _certain(self, part: Index, rotation: Array, translation: Array, depth: Array, normal: Array) -> Array:
         """Exact depth (Q,) m of pairs of parts (Q, 2) at rotations (Q, 2, 3, 3) and translations (Q, 2, 3) m.
@@ -294,6 +300,27 @@ class Overlaps:
             except (QhullError, ValueError):  # no volume
                 width[row] = 0.0
         return np.maximum(width, 0.0)  # type: ignore[no-any-return]
+
+
+def _groups(fixed: Mask, first: Index, second: Index) -> list[Index]:
+    """Bodies of each group: about ``_GROUP`` of those that are not ``fixed`` (n,), with all bodies near them. Bodies
+    near each other are given as pairs (P,), (P,).
+    """
+    both = ~(fixed[first] | fixed[second])
+    component = components(len(fixed), first[both], second[both])
+    near = np.zeros(len(fixed), dtype=bool)
+    near[first] = near[second] = True
+    free = np.flatnonzero(near & ~fixed)
+    sizes = np.bincount(component[free], minlength=len(fixed))
+    group = ((np.cumsum(sizes) - sizes) // _GROUP)[component]
+    groups = []
+    for number in np.unique(group[free]):
+        chosen = np.zeros(len(fixed), dtype=bool)
+        chosen[free[group[free] == number]] = True
+        beside = chosen.copy()
+        beside[second[chosen[first]]] = beside[first[chosen[second]]] = True
+        groups.append(np.flatnonzero(beside))
+    return groups
 
 
 def _aside(kind: Index, position: Array) -> Array:
@@ -348,17 +375,16 @@ class MujocoEngine:
             stage.weigh(self._library.mass[category], self._library.moments[category])
             model, data = stage.model, stage.data
             model.opt.gravity[:] = gravity(course.tilt)
-            steps = max(1, round(duration / TIMESTEP))
+            steps, velocity = max(1, round(duration / TIMESTEP)), data.qvel.reshape(-1, 6)[:count]
+            limits = np.repeat((_STILL_WAY / duration, _STILL_ANGLE / duration), 3)
             for done in range(0, steps, _LOOK):
                 ahead = min(_LOOK, steps - done)
                 mujoco.mj_step(model, data, ahead)
                 course.budget.spent += ahead * count
-                speed = np.abs(data.qvel.reshape(-1, 6)[:count]) * duration
-                still = (speed[:, :3] < _STILL_WAY).all() and (speed[:, 3:] < _STILL_ANGLE).all()
-                if still or course.budget.is_spent:
+                if course.budget.is_spent or (np.abs(velocity) < limits).all():
                     break
                 if course.settling is not None:
-                    data.qvel *= (1.0 - DAMPING) ** (ahead * TIMESTEP)
+                    velocity *= (1.0 - DAMPING) ** (ahead * TIMESTEP)
             end = data.qpos.reshape(-1, 7)[:count].copy()
             lost = bool(data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number)
         rotation, translation, angle = cluster.rotation.copy(), cluster.translation.copy(), np.zeros(len(order))

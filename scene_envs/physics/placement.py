@@ -287,3 +287,15 @@ def simulation_units(objects: Objects, pairs: ObjectPairs) -> float:
         return PER_SCENE
     more = PER_OBJECT * free + PER_PAIR * free * (free - 1) / 2
     return PER_SCENE + min(max(more, MIN_UNITS), MAX_PER_OBJECT * free)
+
+
+def components(count: int, first: Index, second: Index) -> Index:
+    """(count,) number of the connected component of each node, edges given as (P,), (P,)."""
+    lowest = np.arange(count)  # number of a node of the same component
+    while True:
+        least = np.minimum(lowest[first], lowest[second])
+        if (least == lowest[first]).all() and (least == lowest[second]).all():
+            return np.unique(lowest, return_inverse=True)[1]  # type: ignore[no-any-return]
+        np.minimum.at(lowest, first, least)
+        np.minimum.at(lowest, second, least)
+        lowest = lowest[lowest]

@@ -94,7 +94,7 @@ class PhysicsPool(WorkerPool):
             entry = (scene_type, tuple(map(id, own)))
             key, _ = self._scene_types.setdefault(entry, (len(self._scene_types), own))
             once, scene_type = (key, partial(_scene_type_message, key, scene_type)), key
-        arrays = (chunk.translations, chunk.rotations, chunk.categories, chunk.units)
+        arrays = (chunk.translations, chunk.rotations, chunk.categories, chunk.units, chunk.calm)
         return Task(
             (kernel, scene_type, arrays, options),
             f"physics of scenes {first} to {first + len(chunk) - 1}",

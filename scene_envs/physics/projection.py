@@ -22,8 +22,16 @@ from scipy.sparse import csr_array
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import Collider, corner_tests, scene_pairs
 from scene_envs.physics.parts import LibraryGeometry, Rows
-from scene_envs.physics.placement import Budget, Level, Objects, grouped_gaps, object_boxes, part_pairs, place
-from scene_envs.physics.statics import components
+from scene_envs.physics.placement import (
+    Budget,
+    Level,
+    Objects,
+    components,
+    grouped_gaps,
+    object_boxes,
+    part_pairs,
+    place,
+)
 
 CLEARANCE = 2e-5
 """Gap (m) that planes ask for, so that rounding does not leave an overlap."""

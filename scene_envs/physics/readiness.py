@@ -100,7 +100,7 @@ def make_ready(
             break
         scenes = scenes[again]
         left = units[scenes]
-        last = _make_ready_once(last.batch[again.nonzero()[:, 0]], duration, CONVERGED, left, pool)
+        last = _make_ready_once(last.batch[again.nonzero()[:, 0]], duration, CONVERGED, left, pool, last.ready[again])
         units[scenes] = left
         better = last.counts > counts[scenes]
         without_gain[scenes] = (without_gain[scenes] + 1) * ~better
@@ -133,12 +133,18 @@ class _Round:
         return self.ready.sum(dim=-1)
 
 
-def _make_ready_once(batch: SceneBatch, duration: float, iterations: int, units: Tensor, pool: PhysicsPool) -> _Round:
-    """One round of :func:`make_ready`; subtracts the work done from ``units`` (B,), in place."""
+def _make_ready_once(
+    batch: SceneBatch, duration: float, iterations: int, units: Tensor, pool: PhysicsPool, calm: Tensor | None = None
+) -> _Round:
+    """One round of :func:`make_ready`, in which the ``calm`` (B, N) objects stand still unless others reach them; the
+    work done is subtracted from ``units`` (B,), in place.
+    """
     projected = project(batch, pool=pool)
     rows = (projected.valid & ~projected.heap).nonzero()[:, 0]
     options = {"duration": duration, "iterations": iterations}
-    settling = run_kernel("settle", projected.batch[rows], options, pool, units[rows])
+    settling = run_kernel(
+        "settle", projected.batch[rows], options, pool, units[rows], None if calm is None else calm[rows]
+    )
     settled, settled_valid = poses_after(settling, projected.batch[rows])[0], valid_rows(settling)
     left = units[rows] - spent(settling)
     tensor, ready = projected.batch.tensor.clone(), torch.zeros_like(projected.batch.is_empty)

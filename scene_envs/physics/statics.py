@@ -10,8 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import NEAR, scene_pairs
@@ -26,7 +24,7 @@ from scene_envs.physics.parts import (
     outline_of,
     padded,
 )
-from scene_envs.physics.placement import Contacts, ObjectPairs, Objects
+from scene_envs.physics.placement import Contacts, ObjectPairs, Objects, components
 
 _FLAT = 3e-4
 """Tilt (rad) up to which an object counts as upright."""
@@ -365,12 +363,6 @@ def clusters(objects: Objects, low: Array, high: Array) -> Index:
     first, second = rows[first], rows[second]
     near = ((low[first] <= high[second] + _CLEAR) & (low[second] <= high[first] + _CLEAR)).all(axis=1)
     return np.where(objects.fixed, -1, components(len(objects), first[near], second[near]))
-
-
-def components(count: int, first: Index, second: Index) -> Index:
-    """(count,) number of the connected component of each node, edges given as (P,), (P,)."""
-    graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
-    return connected_components(graph, directed=False)[1].astype(np.int64)  # type: ignore[no-any-return]
 
 
 def company(objects: Objects, pairs: ObjectPairs, chosen: Mask) -> Mask:

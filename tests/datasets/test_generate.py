@@ -138,7 +138,7 @@ class _Killed(BaseException):
     """Stands for a killed process."""
 
 
-def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch], list[str]]) -> None:
+def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch, str], list[str]]) -> None:
     """Generate until more than ten candidates are judged, in chunks of five at most."""
     judged = 0
 
@@ -147,7 +147,7 @@ def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch], list[str]])
         judged += len(batch)
         if judged > 10:
             raise _Killed
-        return verdicts(batch)
+        return verdicts(batch, physics)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generation, "judge_scenes", judge)
@@ -157,7 +157,7 @@ def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch], list[str]])
 
 
 def _generate_slowly(output: Path) -> None:
-    def slowly(batch: SceneBatch, physics: str = "auto") -> list[str]:
+    def slowly(batch: SceneBatch, physics: str) -> list[str]:
         time.sleep(0.05)
         return judge_scenes(batch, physics)
 
@@ -194,7 +194,7 @@ def test_what_was_judged_before_a_kill_is_not_judged_again(
     journal.write_text("".join([*lines[:5], *lines[3:], f"{known} penetr"]))  # told twice; killed while it wrote a line
     counted = 0
 
-    def count(batch: SceneBatch, physics: str = "auto") -> list[str]:
+    def count(batch: SceneBatch, physics: str) -> list[str]:
         nonlocal counted
         counted += len(batch)
         return judge_scenes(batch, physics)
@@ -308,7 +308,7 @@ def test_a_grammar_that_was_changed_since_is_judged_anew(tmp_path: Path, monkeyp
     sample = ToyGrammar.sample_array
     with monkeypatch.context() as patch:  # what an earlier grammar made was in order
         patch.setattr(ToyGrammar, "sample_array", lambda self, rng, count: sample(self, rng.spawn(1)[0], count))
-        _generate_and_die(tmp_path, lambda batch: ["kept"] * len(batch))
+        _generate_and_die(tmp_path, lambda batch, physics: ["kept"] * len(batch))
     generate_cups(tmp_path)
     batch = SceneDataset.load(tmp_path).batch()
     assert set(judge_scenes(batch)) == {generation.KEPT}

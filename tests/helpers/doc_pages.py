@@ -140,6 +140,7 @@ NOT_RUN: dict[str, str] = {
 
 NOT_RUN_PYTHON: dict[tuple[str, str], str] = {
     ("docs/datasets.md", 'backend="ray", address="auto"'): "needs a Ray cluster that runs already",
+    ("docs/physics.md", "warp_engine"): "needs the extra gpu and a GPU",
     ("docs/extending.md", '"""A'): "is a module of the package that the page installs; test_extending compares them",
     ("docs/extending.md", '"""Tea'): "likewise",
     ("docs/extending.md", '"""Deep'): "likewise",

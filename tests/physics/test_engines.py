@@ -17,13 +17,14 @@ from scene_envs.physics import (
     feasibility,
     make_pool,
     make_ready,
+    motion,
     penetration,
     project,
     settle,
 )
 from scene_envs.physics import engines as engines_module
 from scene_envs.physics.engines import Course, Moved, engine_name
-from scene_envs.physics.motion import physics_of
+from scene_envs.physics.motion import Physics, physics_of
 from scene_envs.physics.placement import Budget, flatten
 from scene_envs.scene import SceneBatch
 from tests.helpers.simple_scenes import SIDE, scene, turned
@@ -235,3 +236,31 @@ def test_a_pose_that_is_not_finite_is_refused_by_name(engine: str) -> None:
     for call in (feasibility, equilibrium, settle, project, make_ready):
         with pytest.raises(InvalidInputError, match="scene 0, slot 5 holds a pose that is not finite"):
             call(batch, physics=engine)
+
+
+# -- memory -----------------------------------------------------------------------------------------
+
+
+@engines
+def test_what_was_simulated_before_changes_neither_poses_nor_work(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A remembered simulation spends the units it took; where they do not suffice, it is cut as the first one was."""
+    batch = turned(scene(("post", 0.0, 0.0, 0.01)), 1, Rotation.from_euler("x", 0.5).as_matrix())
+    categories, welded = batch.categories.numpy(), batch.is_welded.numpy()
+    poses = batch.translations.double().numpy(), batch.rotations.double().numpy()
+    physics = Physics(physics_of(batch.scene_type, engine).library, engine)
+    objects = flatten(physics.library, *poses, categories, welded)
+    nothing = np.zeros(len(objects), dtype=bool)
+
+    def fall(units: float) -> tuple[Moved, float, bool]:
+        course = Course(Budget(units))
+        moved = physics.simulate(objects, nothing, nothing.astype(np.int64), 0.4, course)
+        return moved, course.budget.spent, course.budget.is_spent
+
+    monkeypatch.setattr(motion, "_KNOWN", 8)
+    cut = fall(30.0)
+    first, again, cut_again = fall(UNITS), fall(UNITS), fall(30.0)
+    assert again[0] is first[0]
+    assert again[1:] == first[1:] == (first[1], False)
+    assert cut[1:] == cut_again[1:] == (cut[1], True)
+    assert np.array_equal(cut[0].translation, cut_again[0].translation)
+    assert not np.array_equal(cut[0].translation, first[0].translation)
