@@ -20,7 +20,7 @@ class Diversity:
     """Mean distance of a scene to the other scenes of its batch, from 0 (all are copies) to 1 (nothing in common).
 
     The distance matches objects of the same asset one to one at the least cost
-    (:func:`scene_envs.scene.scene_distances`). It is divided by its largest value. A batch of one scene is
+    (:func:`scene_envs.scene.matching_distance`). It is divided by its largest value. A batch of one scene is
     invalid.
 
     >>> scenes = SceneBatch.empty("dimsum_table", 2)

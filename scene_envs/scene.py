@@ -396,29 +396,6 @@ def cutoff(scene_type: SceneType) -> float:
     return 0.25 * max(high[0] - low[0], high[1] - low[1])
 
 
-def scene_distances(batch: SceneBatch, other: SceneBatch) -> Tensor:
-    """(B,) m: distance of each scene from its counterpart in ``other``, as sets of objects; orientations do not count.
-
-    This is the OSPA distance of order 1 (Schuhmacher, Vo and Vo, 2008). Objects are matched one to one at the least
-    total cost. A match costs the distance of the two positions, at most c, or c when the assets differ; an object
-    without a match costs c, the :func:`cutoff`. The total is divided by the number of objects of the larger scene,
-    without fixed welded ones. The assignment is exact: the limit of Sinkhorn iterations as their regularisation goes to
-    zero. Raises InvalidInputError for another number of scenes, or scenes of other assets.
-
-    >>> from scene_envs.grammars import get_grammar
-    >>> scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 2)
-    >>> shuffled = SceneBatch(scenes.tensor.flip(1), scenes.scene_type)
-    >>> scene_distances(shuffled, scenes)
-    tensor([0., 0.], dtype=torch.float64)
-    """
-    check_same_assets(batch, other)
-    if len(batch) != len(other):
-        raise InvalidInputError(f"{len(batch)} scenes have no counterparts in {len(other)}; give as many")
-    limit = cutoff(batch.scene_type)
-    pairs = zip(SceneObjects(batch), SceneObjects(other), strict=True)
-    return torch.tensor([matching_distance(first, second, limit) for first, second in pairs], dtype=torch.float64)
-
-
 class SceneObjects:
     """The counted objects of each scene of a batch, sorted by category; each scene is computed on first use."""
 
@@ -449,7 +426,14 @@ def counted_objects(batch: SceneBatch) -> Tensor:
 
 
 def matching_distance(first: PlacedObjects, second: PlacedObjects, limit: float) -> float:
-    """Distance (m) of two scenes, as in :func:`scene_distances`; ``limit`` (m) is the cost of an unmatched object."""
+    """Distance (m) of two scenes as sets of objects; orientations do not count.
+
+    This is the OSPA distance of order 1 (Schuhmacher, Vo and Vo, 2008). Objects are matched one to one at the least
+    total cost. A match costs the distance of the two positions, at most ``limit`` (m), or ``limit`` when the assets
+    differ; an object without a match costs ``limit``, as :func:`cutoff` gives it. The total is divided by the number of
+    objects of the larger scene. The assignment is exact: the limit of Sinkhorn iterations as their regularisation goes
+    to zero.
+    """
     from scipy.optimize import linear_sum_assignment
 
     count, larger = len(first[0]), max(len(first[0]), len(second[0]))

@@ -106,14 +106,14 @@ class Neighbors:
     ([2, 3], [0.0, 0.0], [True, True])
     """
 
-    distance: Tensor  # (B,) m, see :func:`scene_envs.scene.scene_distances`
+    distance: Tensor  # (B,) m, see :func:`scene_envs.scene.matching_distance`
     index: Tensor  # (B,) int64
     copied: Tensor  # (B,) bool, one of the other scenes has the same assets, each within 1 cm
 
 
 def nearest_scenes(batch: SceneBatch, others: SceneBatch, *, candidates: int = CANDIDATES) -> Neighbors:
     """The scene of ``others`` that is nearest to each scene of ``batch``, by its :func:`distance
-    <scene_envs.scene.scene_distances>`.
+    <scene_envs.scene.matching_distance>`.
 
     The distance is computed exactly for the ``candidates`` scenes that are nearest by features. A feature is the sum of
     a function of the position over all objects of one asset. The functions are bounded and have slope 1 at most, so

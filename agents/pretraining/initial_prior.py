@@ -39,8 +39,6 @@ from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import get_scene_type, register_scene_type, union_scene_type
 
-MOMENTS = ("category", "feature", "scene")
-"""Groups of values whose mean and standard deviation the preconditioning of a network uses."""
 FITTED_ON = 20_000
 """Largest number of scenes to which moments are fitted."""
 PROMPTS_PER_SCENE = 3

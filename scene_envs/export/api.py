@@ -16,7 +16,6 @@ from scene_envs.export.placed import AssetFiles, identifier, place
 from scene_envs.files import write_json
 from scene_envs.physics.parts import FRICTION
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import SceneType
 
 MANIFEST = "export.json"
 
@@ -129,9 +128,8 @@ def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
 def _digest(batch: SceneBatch) -> str:
     """Digest of the poses, and of the geometry and mass of the assets."""
     digest = hashlib.sha256(batch.tensor.cpu().contiguous().numpy().tobytes())
-    scene_type: SceneType = batch.scene_type
-    digest.update(repr((scene_type.assets, scene_type.welded)).encode())
-    for asset in scene_type.library:
+    digest.update(repr((batch.scene_type.assets, batch.scene_type.welded)).encode())
+    for asset in batch.scene_type.library:
         digest.update(repr((asset.name, asset.mass, asset.static)).encode())
         digest.update(asset.inertia.tobytes() + asset.center_of_mass.tobytes())
         for part in asset.fine:

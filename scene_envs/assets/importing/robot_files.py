@@ -131,12 +131,18 @@ def _pose(element: Element | None, path: Path, where: str) -> Array:
     return pose_of(values[:3], from_roll_pitch_yaw(angles))
 
 
-def _sdf_shape(element: Element, pose: Array, path: Path, where: str) -> Shape | None:
+def _geometry(element: Element, path: Path, where: str) -> Element:
+    """What stands first in the ``geometry`` of an element."""
     geometry = element.find("geometry")
     kinds = [] if geometry is None else [child for child in geometry if isinstance(child.tag, str)]
     if not kinds:
         raise CorruptFileError(f"{path}: {where} has no geometry")
-    kind, color = kinds[0], color_of(element.findtext("material/diffuse"), path, f"colour of {where}")
+    return kinds[0]
+
+
+def _sdf_shape(element: Element, pose: Array, path: Path, where: str) -> Shape | None:
+    kind = _geometry(element, path, where)
+    color = color_of(element.findtext("material/diffuse"), path, f"colour of {where}")
     if kind.tag == "plane":
         return None
     if kind.tag == "mesh":
@@ -253,11 +259,7 @@ def _urdf_shape(element: Element, link: Array, materials: dict[str, Color | None
     pose = link @ _origin(element, path, where)
     material = element.find("material")
     color = None if material is None else _own_color(material, path) or materials.get(material.get("name", ""))
-    geometry = element.find("geometry")
-    kinds = [] if geometry is None else [child for child in geometry if isinstance(child.tag, str)]
-    if not kinds:
-        raise CorruptFileError(f"{path}: {where} has no geometry")
-    kind = kinds[0]
+    kind = _geometry(element, path, where)
     if kind.tag == "mesh":
         filename = kind.get("filename")
         if not filename:

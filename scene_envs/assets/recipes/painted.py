@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from scene_envs.arrays import Array
-from scene_envs.assets.shapes import Color, Profile, arc, circle, join, quad_faces, sheet, surface, walls
+from scene_envs.assets.shapes import Color, Profile, arc, circle, grid_faces, join, quad_faces, sheet, surface, walls
 
 Cells = NDArray[np.int64]
 """Indices into the colours of a surface, one per cell."""
@@ -96,17 +96,11 @@ def _normals(points: Array, section: Array) -> Array:
 
 def _painted(points: Array, normals: Array, chosen: Cells, colors: Sequence[Color]) -> trimesh.Trimesh:
     """A grid of points (P, S, 3), closed around, with one colour per cell (P - 1, S)."""
-    rows, segments = points.shape[:2]
-    grid = np.arange(rows * segments).reshape(rows, segments)
-    a, b = grid[:-1], np.roll(grid[:-1], -1, axis=1)
-    d, c = grid[1:], np.roll(grid[1:], -1, axis=1)
+    triangles, of = grid_faces(*points.shape[:2]), np.tile(chosen.ravel(), 2)
     flat, shading = points.reshape(-1, 3), normals.reshape(-1, 3)
     meshes = []
     for index in np.unique(chosen):
-        cells = chosen == index
-        faces = np.concatenate(
-            [np.stack([a[cells], b[cells], c[cells]], axis=1), np.stack([a[cells], c[cells], d[cells]], axis=1)]
-        )
+        faces = triangles[of == index]
         corners = flat[faces]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         used, faces = np.unique(faces[area > 1e-12], return_inverse=True)
