@@ -361,7 +361,7 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     for key in set(_DATASETS) - kept - set(getattr(settings, "NO_PATHS", ())):
         _check_dataset(key, functools.reduce(lambda value, part: getattr(value, part, None), key.split("."), settings))
     _check_guidance(settings)
-    if physics := getattr(settings, "physics", ""):
+    if (physics := getattr(settings, "physics", "auto")) != "auto":  # what auto takes is said in the log of the run
         from scene_envs.physics.engines import engine_name
 
         engine_name(physics)

@@ -1,7 +1,8 @@
-"""Engines: what computes the overlap and the motion of objects, by name.
+"""Engines: what computes the motion of objects, by name.
 
-What is feasible, ready, at rest or projected is decided once, above the engines. An engine is asked how deep objects
-overlap and where a cluster of objects is after some time.
+What is feasible, ready, at rest or projected is decided once, above the engines. An engine is asked where a cluster of
+objects is after some time. Overlaps of CPU engines are the same exact ones (:mod:`scene_envs.physics.collision`); Warp
+computes its own, on the device of the scenes.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Course:
 
 
 class Engine(Protocol):
-    """What computes overlap and motion of the objects of one asset library. Results depend on the arguments alone."""
+    """What computes motion of the objects of one asset library. Results depend on the arguments alone."""
 
     def simulate(self, cluster: Objects, fine: Mask, height: Index, duration: float, course: Course) -> Moved:
         """Where the objects (n,) of one scene are after ``duration`` seconds under gravity.
