@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -38,7 +38,7 @@ _FAR = 1e5
 """Height (m) of the first body that is not used, and distance between such bodies."""
 _SIZES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 2048, 4096)
 """Numbers of bodies, and of geometries per body, for which models are made."""
-_MODELS = 64
+_MODELS = 32
 """Number of models that are kept; the one that was used longest ago goes first."""
 _ITERATIONS = 200
 """Largest number of iterations of the narrowphase where depths are asked for: more change nothing."""
@@ -52,8 +52,9 @@ _ROUNDING = 1e-9
 _CERTAIN = 3.5e-6
 """Largest difference (m) of MuJoCo's depth and the width of both parts along its normal at which the width is taken as
 the depth: the true depth is between the two."""
-_ARENA = 1 << 26
-"""Bytes for the contacts of a model."""
+_ARENA, _ROOMS = 1 << 19, (1, 16)
+"""Bytes for the contacts of each body of a model, at least for eight; where they do not suffice, the work is done again
+with a model of more room."""
 _GROUP = 32
 """Bodies that are asked for their overlaps together: models for many more are slow."""
 _TOO_MANY = 600_000
@@ -78,7 +79,7 @@ class _Models:
 
     def __init__(self, parts: Sequence[Array], bodies: Sequence[_Body]) -> None:
         self._parts = [_solid(corners).ravel().tolist() for corners in parts]
-        self._stages: dict[Sizes, _Stage] = {}
+        self._stages: dict[tuple[Sizes, int], _Stage] = {}
         spec = self._spec()
         for body in bodies:
             self._add(spec, body.parts, body.translation, np.roll(quaternions(body.rotation[None])[0], 1))
@@ -93,7 +94,6 @@ class _Models:
 
     def _spec(self) -> Any:
         spec = mujoco.MjSpec()
-        spec.memory = _ARENA
         option = spec.option
         option.timestep, option.impratio = TIMESTEP, 10.0
         option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -111,9 +111,10 @@ class _Models:
             geometry.solref[:], geometry.solimp[:] = SOLREF, SOLIMP
         return body
 
-    def compile(self, sizes: Sizes) -> Any:
+    def compile(self, sizes: Sizes, room: int) -> Any:
         """A model with places for bodies of ``sizes``."""
         spec = self._spec()
+        spec.memory = room * _ARENA * max(8, sizes[0])
         for free, bodies, geometries in ((True, *sizes[:2]), (False, *sizes[2:])):
             for _ in range(bodies):
                 body = self._add(spec, [0] * geometries)
@@ -121,13 +122,13 @@ class _Models:
                     body.add_freejoint()
         return spec.compile()
 
-    def stage(self, kind: Index, fixed: Mask) -> _Stage:
-        """The smallest stage in which bodies of the given ``kind`` (n,) fit."""
+    def stage(self, kind: Index, fixed: Mask, room: int) -> _Stage:
+        """The smallest stage with this ``room`` for contacts in which bodies of the given ``kind`` (n,) fit."""
         counts = self.count[kind]
         needed = [(~fixed).sum(), counts[~fixed].max(initial=0), fixed.sum(), counts[fixed].max(initial=0)]
         sizes: Any = tuple(next((size for size in (0, *_SIZES) if size >= count), int(count)) for count in needed)
-        stage = self._stages.pop(sizes, None) or _Stage(self, sizes)
-        self._stages[sizes] = stage  # the last used one is the last
+        stage = self._stages.pop((sizes, room), None) or _Stage(self, sizes, room)
+        self._stages[sizes, room] = stage  # the last used one is the last
         if len(self._stages) > _MODELS:
             del self._stages[next(iter(self._stages))]
         return stage
@@ -136,9 +137,9 @@ class _Models:
 class _Stage:
     """A model and its state, into which bodies are put."""
 
-    def __init__(self, models: _Models, sizes: Sizes) -> None:
+    def __init__(self, models: _Models, sizes: Sizes, room: int) -> None:
         self._models, self._free = models, sizes[0]
-        self.model = models.compile(sizes)
+        self.model = models.compile(sizes, room)
         self.data = mujoco.MjData(self.model)
         self.model.geom_sameframe[:] = 0
         self._fields = {name: getattr(self.model, name) for name in (*_GEOMETRY, *_NODE)}  # views of the model's arrays
@@ -188,6 +189,34 @@ class _Stage:
         model.body_invweight0[1 : 1 + count] = weights
         model.dof_invweight0[: 6 * count] = np.repeat(weights, 3, axis=1).ravel()
 
+    @property
+    def is_full(self) -> bool:
+        """Whether contacts were left out for want of room."""
+        full = mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL
+        return any(self.data.warning[index].number for index in full)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the simulation diverged."""
+        bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+        return any(self.data.warning[index].number for index in bad)
+
+    def run(self, count: int, duration: float, course: Course) -> Array:
+        """Positions and orientations (count, 7) of the first free bodies at the end of a simulation, or at rest."""
+        model, data = self.model, self.data
+        model.opt.gravity[:] = gravity(course.tilt)
+        steps, velocity = max(1, round(duration / TIMESTEP)), data.qvel.reshape(-1, 6)[:count]
+        limits = np.repeat((_STILL_WAY / duration, _STILL_ANGLE / duration), 3)
+        for done in range(0, steps, _LOOK):
+            ahead = min(_LOOK, steps - done)
+            mujoco.mj_step(model, data, ahead)
+            course.budget.spent += ahead * count
+            if course.budget.is_spent or self.is_full or (np.abs(velocity) < limits).all():
+                break
+            if course.settling is not None:
+                velocity *= (1.0 - DAMPING) ** (ahead * TIMESTEP)
+        return data.qpos.reshape(-1, 7)[:count].copy()  # type: ignore[no-any-return]
+
     def overlaps(self) -> tuple[Index, Index, Array, Array] | None:
         """Bodies (Q, 2) and parts (Q, 2) of each pair of overlapping geometries, depth (Q,) m and normal (Q, 3) from
         the first to the second; None where there are too many.
@@ -200,7 +229,7 @@ class _Stage:
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
         option.disableflags, option.ccd_iterations = flags, iterations
-        if data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL].number:
+        if self.is_full:
             return None
         contact = data.contact
         geometry, inside = contact.geom.astype(np.int64), contact.dist < 0
@@ -262,10 +291,14 @@ class Overlaps:
         bodies: list[Index] = [np.empty((0, 2), dtype=np.int64)]
         depths: list[Array] = [np.empty(0)]
         for some in _groups(fixed, first, second):
-            with self._lock:
-                stage = self._models.stage(kind[some], fixed[some])
-                rows = stage.place(kind[some], fixed[some], position[some], quaternion[some])
-                found = stage.overlaps()
+            found = None
+            for room in _ROOMS:
+                with self._lock:
+                    stage = self._models.stage(kind[some], fixed[some], room)
+                    rows = stage.place(kind[some], fixed[some], position[some], quaternion[some])
+                    found = stage.overlaps()
+                if found is not None:
+                    break
             if found is None:
                 return None
             body = some[rows[found[0]]]
@@ -369,24 +402,17 @@ class MujocoEngine:
         position = some.translation + apply(some.rotation, center[some.category])
         start = quaternions(times(some.rotation, self._library.axes[some.category]))
         kind = 2 * some.category + fine[order]
-        with self._lock:
-            stage = self._models.stage(kind, some.fixed)
-            stage.place(kind, some.fixed, position, np.roll(start, 1, axis=1))
-            stage.weigh(self._library.mass[category], self._library.moments[category])
-            model, data = stage.model, stage.data
-            model.opt.gravity[:] = gravity(course.tilt)
-            steps, velocity = max(1, round(duration / TIMESTEP)), data.qvel.reshape(-1, 6)[:count]
-            limits = np.repeat((_STILL_WAY / duration, _STILL_ANGLE / duration), 3)
-            for done in range(0, steps, _LOOK):
-                ahead = min(_LOOK, steps - done)
-                mujoco.mj_step(model, data, ahead)
-                course.budget.spent += ahead * count
-                if course.budget.is_spent or (np.abs(velocity) < limits).all():
-                    break
-                if course.settling is not None:
-                    velocity *= (1.0 - DAMPING) ** (ahead * TIMESTEP)
-            end = data.qpos.reshape(-1, 7)[:count].copy()
-            lost = bool(data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number)
+        for room in _ROOMS:
+            budget = replace(course.budget)
+            with self._lock:
+                stage = self._models.stage(kind, some.fixed, room)
+                stage.place(kind, some.fixed, position, np.roll(start, 1, axis=1))
+                stage.weigh(self._library.mass[category], self._library.moments[category])
+                end = stage.run(count, duration, replace(course, budget=budget))
+                lost = stage.is_full or stage.is_lost
+            if not stage.is_full:
+                break
+        course.budget.spent = budget.spent
         rotation, translation, angle = cluster.rotation.copy(), cluster.translation.copy(), np.zeros(len(order))
         rows, after = order[:count], np.roll(end[:, 3:], -1, axis=1)
         rotation[rows] = times(matrices(after), self._library.axes[category].swapaxes(1, 2))
