@@ -223,9 +223,11 @@ def test_scenes_that_take_too_long_twice_are_invalid(
     few: SceneBatch, ray_pool: PhysicsPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     feasibility(few[:1], pool=ray_pool)  # a worker is up
+    lift = torch.tensor([0.0, 0.0, 0.1]) * few[:2].is_free[..., None]
+    above = few[:2].with_poses(few[:2].translations + lift, few[:2].rotations)
     with monkeypatch.context() as patch:
         patch.setattr(ray_pool, "timeout", 1e-4)
-        assert feasibility(few[:2], pool=ray_pool).valid.tolist() == [False, False]
+        assert settle(above, pool=ray_pool).valid.tolist() == [False, False]
     assert feasibility(few[:2], pool=ray_pool).valid.tolist() == [True, True]  # the pool stays usable
 
 
