@@ -386,6 +386,26 @@ def test_check_env_passes_with_a_choice_of_masks(mask_kwargs: dict[str, Any], mo
         check_branchable(gym.make(MASK_ID, **mask_kwargs), children=6)
 
 
+@pytest.mark.parametrize("copies", [None, 2])
+@pytest.mark.parametrize("name", ["Denoising-v0", "Search-v0", "SearchMask-v0"])
+def test_torchrl_wraps_every_environment(name: str, copies: int | None, mask_kwargs: dict[str, Any]) -> None:
+    from torchrl.envs import GymWrapper
+    from torchrl.envs.utils import check_env_specs
+
+    name, kwargs = f"scene_envs:SceneEnvs/{name}", dict(mask_kwargs)
+    if "Search-" in name:
+        del kwargs["masks"]
+    if "Denoising" in name:
+        kwargs = {"prior": kwargs["prior"], "reward": "object_count", "num_steps": 2}
+    if copies is None:
+        env = GymWrapper(gym.make(name, **kwargs))
+    else:
+        makers = [lambda: gym.make(name, **kwargs)] * copies
+        env = GymWrapper(gym.vector.SyncVectorEnv(makers, autoreset_mode=gym.vector.AutoresetMode.DISABLED))
+    check_env_specs(env, seed=0, break_when_any_done="both")
+    assert env.rollout(2).batch_size == (() if copies is None else (copies,)) + (2,)
+
+
 def test_two_environments_with_a_choice_of_masks_live_the_same_life(mask_kwargs: dict[str, Any]) -> None:
     first, second = gym.make(MASK_ID, **mask_kwargs), gym.make(MASK_ID, **mask_kwargs)
     assert data_equivalence(first.reset(seed=3), second.reset(seed=3), exact=True)
