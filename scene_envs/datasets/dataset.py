@@ -27,10 +27,11 @@ from scene_envs.datasets.files import (
     read_rows,
     shard_name,
     to_rows,
+    write_metadata,
     write_shard,
 )
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
-from scene_envs.files import find_scenes, is_dataset, scene_files, with_digest, write_json
+from scene_envs.files import find_scenes, is_dataset, scene_files
 from scene_envs.normalizer import Normalizer
 from scene_envs.rotations import project_to_so3
 from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, ROTATION, SceneBatch
@@ -259,7 +260,7 @@ class SceneDataset:
         folder.mkdir(parents=True, exist_ok=True)
         metadata = make_metadata(self.scene_type, self.normalizer, count=len(self))
         metadata["max_num_objects_per_scene"] = self.tensor.shape[1]
-        write_json(folder / METADATA, with_digest(metadata), indent=2)
+        write_metadata(folder, metadata)
         for index, start in enumerate(range(0, len(self), shard_size)):
             chunk = slice(start, start + shard_size)
             scenes = self.normalizer.normalize(self.tensor[chunk]).numpy()

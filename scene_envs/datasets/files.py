@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
-from scene_envs.files import replacing, with_digest, without_digest
+from scene_envs.files import replacing, with_digest, without_digest, write_json, write_text
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE_FEATURES
 from scene_envs.scene_types import SceneType
@@ -55,6 +55,28 @@ def make_metadata(scene_type: SceneType, normalizer: Normalizer, **extra: Any) -
         "normalizer_state": normalizer.state(),
         **extra,
     }
+
+
+_CARD = """---
+configs:
+- config_name: default
+  data_files: "*.parquet"
+---
+
+# Scenes of {scene_type}
+
+Each row is a scene: `scenes` (slots x features, normalised as `metadata.json` says), `language_annotation` (one
+prompt) and `language_annotations` (all of them). `SceneDataset.load` of SceneEnvs reads this folder, and so does
+`load_dataset` of Hugging Face.
+"""
+
+
+def write_metadata(folder: Path, metadata: dict[str, Any]) -> None:
+    """``metadata.json``, and a dataset card (``README.md``) that names the data files to Hugging Face ``datasets``."""
+    card = folder / "README.md"
+    if not card.exists():
+        write_text(card, _CARD.format(scene_type=metadata["scene_type"]))
+    write_json(folder / METADATA, with_digest(metadata), indent=2)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

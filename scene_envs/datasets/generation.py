@@ -31,10 +31,11 @@ from scene_envs.datasets.files import (
     shard_name,
     verify,
     write_bytes,
+    write_metadata,
 )
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import CorruptFileError, InvalidInputError, PhysicsError, unknown_name
-from scene_envs.files import storage_error, sweep, with_digest, write_json
+from scene_envs.files import storage_error, sweep
 from scene_envs.grammars import Grammar, get_grammar
 from scene_envs.grammars.grammar import grammar_factory
 from scene_envs.normalizer import Normalizer
@@ -275,7 +276,7 @@ def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normal
     except OSError as error:
         raise storage_error(folder, error) from error
     normalizer = fixed_normalizer(grammar)
-    write_json(path, with_digest(make_metadata(scene_type, normalizer, **settings)), indent=2)
+    write_metadata(folder, make_metadata(scene_type, normalizer, **settings))
     return normalizer
 
 

@@ -51,11 +51,13 @@ def test_save_and_load_give_the_same_scenes(dataset: SceneDataset, folder: Path)
     assert (loaded.tensor[..., 2][on_table] == 0).all()
 
 
-def test_hugging_face_datasets_reads_the_shards(dataset: SceneDataset, folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("shard_size", [25, 2000])
+def test_hugging_face_datasets_reads_the_folder(dataset: SceneDataset, tmp_path: Path, shard_size: int) -> None:
     import datasets
 
-    files = sorted(map(str, folder.glob("*.parquet")))
-    loaded = datasets.load_dataset("parquet", data_files=files, cache_dir=str(tmp_path / "cache"))["train"]
+    folder = dataset.save(tmp_path / "scenes", shard_size=shard_size)
+    loaded = datasets.load_dataset(str(folder), cache_dir=str(tmp_path / "cache"))["train"]
+    assert len(loaded) == len(dataset)
     assert loaded.column_names == ["scenes", "language_annotation", "language_annotations"]
     assert loaded["language_annotation"][:] == dataset.prompts
     assert [tuple(prompts) for prompts in loaded["language_annotations"][:]] == dataset.prompt_sets
