@@ -19,8 +19,7 @@ PROMPT_SOURCES = ("data", "grammar")
 _MAX_SLOTS = 100_000
 _MAX_NUMBER = 1e30
 MASKS = (
-    "balanced", "blamed_or_empty", "culprits", "empty", "explicit", "infeasible", "infeasible_or_empty",
-    "lowest_scoring", "off_prompt", "penetrating", "random", "region", "unstable",
+    "balanced", "blamed_or_empty", "culprits", "empty", "infeasible", "infeasible_or_empty", "off_prompt", "random",
 )  # fmt: skip
 """Names of the mask generators of :mod:`scene_envs.envs.masks`."""
 
