@@ -349,7 +349,7 @@ def test_an_episode_that_is_over_at_its_reset_ends_with_the_first_step(prior, fr
     assert env.step(0)[1] == 0.0
 
 
-@pytest.mark.parametrize("objective", ["diversity", {"name": "clip", "reward": "coverage", "low": 0.0}])
+@pytest.mark.parametrize("objective", ["diversity", {"name": "clip", "reward": "diversity", "low": 0.0}])
 def test_an_objective_that_depends_on_the_batch_is_refused(prior, objective):
     with pytest.raises(InvalidInputError, match="by the other scenes of its batch"):
         SearchEnv(prior=prior, objective=objective, branching=3, num_steps=2)
