@@ -326,7 +326,6 @@ class DatasetInfo:
         welded_model_paths: Paths of the welded assets.
         slots: N, the number of slots per scene; None when the file does not say.
         scene_type: Name of the scene type; None in datasets of others.
-        count: Number of requested scenes; None when the file does not say.
         metadata: All keys of the file but the digest.
     """
 
@@ -336,7 +335,6 @@ class DatasetInfo:
     welded_model_paths: tuple[str, ...] = ()
     slots: int | None = None
     scene_type: str | None = None
-    count: int | None = None
     metadata: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -402,8 +400,8 @@ def _parse(file: Path, metadata: dict[str, Any]) -> DatasetInfo:
     paths = tuple(map(str, metadata["model_paths"] or ()))
     try:
         normalizer = Normalizer.from_state(metadata["normalizer_state"])
-        numbers = [metadata.get(key) for key in ("max_num_objects_per_scene", "count")]
-        slots, count = (None if number is None else int(number) for number in numbers)
+        number = metadata.get("max_num_objects_per_scene")
+        slots = None if number is None else int(number)
     except (InvalidInputError, TypeError, ValueError) as error:
         raise CorruptFileError(f"{str(file)!r}: {error}") from error
     for key, wanted in (("translation_vec_len", 3), ("model_path_vec_len", len(paths) + 1)):
@@ -417,7 +415,6 @@ def _parse(file: Path, metadata: dict[str, Any]) -> DatasetInfo:
         welded_model_paths=tuple(map(str, metadata.get("welded_object_model_paths") or ())),
         slots=slots,
         scene_type=metadata.get("scene_type"),
-        count=count,
         metadata=metadata,
     )
 
