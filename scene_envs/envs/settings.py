@@ -222,7 +222,7 @@ def _shown(value: Any) -> str:
     return "a very large number" if isinstance(value, int) and abs(value) > _MAX_NUMBER else repr(value)[:200]
 
 
-def takes(settings: type[EnvSettings]) -> Callable[[Init], Init]:
+def takes(settings: type[Any]) -> Callable[[Init], Init]:
     """Decorator of an ``__init__`` with ``**settings``: its signature shows the fields of ``settings``."""
 
     def decorate(init: Init) -> Init:
