@@ -10,7 +10,7 @@ import gymnasium as gym
 import pytest
 
 from agents.priors.testing import tiny_prior
-from scene_envs import check_branchable
+from scene_envs.envs import check_branchable
 from scene_envs.envs.branchable import NotBranchableError
 from tests.helpers.toy_prior import ToyPrior
 

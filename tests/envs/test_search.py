@@ -20,8 +20,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from agents.planning import BeamPlanner, BestOfPlanner, GreedyPlanner, Journal, MCTSPlanner, Session
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardOutput
-from scene_envs import check_branchable
-from scene_envs.envs import ResetNeededError, SearchEnv, SearchMaskEnv
+from scene_envs.envs import ResetNeededError, SearchEnv, SearchMaskEnv, check_branchable
 from scene_envs.envs.search import NodeRandomness
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.render import render
