@@ -36,7 +36,7 @@ from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import CorruptFileError, InvalidInputError, PhysicsError, unknown_name
 from scene_envs.files import storage_error, sweep, with_digest, write_json
 from scene_envs.grammars import Grammar, get_grammar
-from scene_envs.grammars.grammar import grammar_factory
+from scene_envs.grammars.grammar import GRAMMARS
 from scene_envs.normalizer import Normalizer
 from scene_envs.physics.engines import engine_name
 from scene_envs.progress import Progress
@@ -186,7 +186,7 @@ def _make(
             report(*progress)
         return
     is_ray = backend == "ray"
-    factory, scene_type = grammar_factory(name), get_scene_type(grammar.scene_type)
+    factory, scene_type = GRAMMARS[name], get_scene_type(grammar.scene_type)
     made = factory, replace(scene_type), normalizer.state()  # a copy of the scene type, without built assets
     inputs = _pickled(factory, made, is_ray)
 
