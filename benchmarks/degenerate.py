@@ -42,12 +42,8 @@ REWARDS = {
     "prompt_match": make_reward("prompt_match"),
     "clip": make_reward("clip", reward="feasible_objects", high=3.0),
     "product": make_reward("product", rewards=["object_count", "feasible_objects"]),
-    **{
-        name: make_reward(name)
-        for name in ("feasible_share", "clutter", "stability", "reachability", "coverage", "diversity")
-    },
+    **{name: make_reward(name) for name in ("feasible_share", "clutter", "stability", "reachability", "diversity")},
     "penetration (reward)": make_reward("penetration"),
-    "relation": make_reward("relation"),
     "realism": make_reward("realism"),
     "weighted_sum": make_reward("weighted_sum", rewards=["object_count", "feasible_objects"], weights=[1.0, 1.0]),
 }

@@ -124,7 +124,7 @@ def _prepare_union(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Te
         )
     whole = [SceneDataset.load(folder.strip()) for folder in config.data.split(",")]
     union = register_scene_type(union_scene_type([dataset.scene_type for dataset in whole]))
-    parts = [dataset.stable_split((0.98, 0.02), seed=0) for dataset in whole]
+    parts = [dataset.split((0.98, 0.02), seed=0) for dataset in whole]
     share = slice(min(5000, FITTED_ON // len(whole)))  # moments see scenes of every type
     some = torch.cat([to_union(dataset.batch(share), union).tensor for dataset, _ in parts])
     normalizer = union_normalizer([dataset.normalizer for dataset in whole], union)

@@ -55,7 +55,7 @@ def test_each_scene_has_a_folder_and_assets_are_shared(folder, batch):
     assert len([name for name in names if name.startswith("scene_")]) == len(batch)
     used = {name for row in batch.names() for name in row}
     assert {path.name for path in (folder / "assets").iterdir()} == used
-    expected = {"objects.json", "world.sdf", "scene.dmd.yaml", "scene.xml", "scene.glb", "scene.npz", "scene.pkl"}
+    expected = {"objects.json", "world.sdf", "scene.dmd.yaml", "scene.xml", "scene.glb", "scene.npz"}
     assert expected <= {path.name for path in (folder / "scene_000").iterdir()}
     parts = sorted((folder / "assets" / "teacup").glob("part_*.obj"))
     assert len(parts) == len(DIMSUM.library["teacup"].fine)
@@ -254,13 +254,13 @@ def test_only_usd_needs_a_package_and_says_which(tmp_path, monkeypatch):
         export(laid_scene(), tmp_path / "out", "usd")
     assert not (tmp_path / "out").exists()
     report = export(laid_scene(), tmp_path / "out")
-    assert set(report.formats) == {*TEXT, "glb", "npz", "pickle"}
+    assert set(report.formats) == {*TEXT, "glb", "npz"}
 
 
 def test_writing_needs_no_simulator(tmp_path, monkeypatch):
     for name in ("pybullet", "mujoco", "pydrake", "pxr"):
         monkeypatch.setitem(sys.modules, name, None)  # importing it fails
-    export(laid_scene(), tmp_path / "out", [*TEXT, "glb", "npz", "pickle"])
+    export(laid_scene(), tmp_path / "out", [*TEXT, "glb", "npz"])
 
 
 def test_no_scenes_and_empty_scenes_are_fine(tmp_path):
