@@ -15,9 +15,7 @@ from agents.networks.registry import (
     NETWORKS,
     build_network,
     list_networks,
-    match_parameters,
     network_config,
-    parameter_count,
     register_network,
 )
 from agents.networks.text import TextConfig, TextEncoder
@@ -40,8 +38,6 @@ __all__ = [
     "TextEncoder",
     "build_network",
     "list_networks",
-    "match_parameters",
     "network_config",
-    "parameter_count",
     "register_network",
 ]
