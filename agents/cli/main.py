@@ -6,6 +6,7 @@ traceback only under ``--traceback`` or ``SCENE_ENVS_TRACEBACK=1``.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import dataclasses
 import errno
@@ -64,6 +65,11 @@ scene-envs COMMAND --help lists the keys of a command; --traceback shows where a
 --allow-local allows reward=./my_rewards.py:clutter to run that file without a question.
 A command writes into output=FOLDER, by default runs/COMMAND-TIME.
 """
+_FLAGS = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+for _names in (["--config-dir"], ["--config"], ["--cfg", "-c"]):
+    _FLAGS.add_argument(*_names, default="")
+for _names in (["--allow-local"], ["--multirun", "-m"], ["--help", "-h"]):
+    _FLAGS.add_argument(*_names, action="store_true")
 _MINIMA = {
     "count": 1,
     "num_steps": 1,
@@ -177,16 +183,19 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str]) -> int:
-    words = list(words)
-    config_dir, file = _option(words, "--config-dir"), _option(words, "--config")
-    allow_local = _flag(words, "--allow-local")
-    shown, sweep, asked = _option(words, "--cfg", "-c"), _flag(words, "--multirun", "-m"), _flag(words, "-h", "--help")
+    try:
+        flags, words = _FLAGS.parse_known_args(words)
+    except argparse.ArgumentError as error:
+        name = str(error.argument_name).partition("/")[0]
+        wrong = "takes no value" if "explicit" in error.message else f"needs a value behind it, as in {name} VALUE"
+        raise InvalidInputError(f"{name} {wrong}") from None
+    config_dir, file, shown, sweep = flags.config_dir, flags.config, flags.cfg, flags.multirun
     if shown not in ("", "job"):
         raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
     command = program.removeprefix("scene-envs ")
     named = _named(words, getattr(module, "POSITIONAL", ()))
     keys = keys_of(module)
-    if asked:
+    if flags.help:
         config = keys if sweep or not named else compose(command, keys, named, config_dir, file)
         print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
         return DONE
@@ -195,7 +204,7 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
     variants = expand_sweeps(named) if sweep else [(named, "")]
     runs = [(compose(command, keys, variant, config_dir, file), label) for variant, label in variants]
     for settings, _ in runs if not shown else ():
-        _check(settings, module, allow_local)
+        _check(settings, module, flags.allow_local)
     folder = ""
     for settings, label in runs:
         if sweep:  # each run has a folder of its own below ``output``
@@ -230,29 +239,6 @@ def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> No
         settings = settings if settings.output else replace(settings, output=fresh_directory(command))
         with Run(command, settings) as run:
             module.run(settings, run)
-
-
-def _option(words: list[str], *names: str) -> str:
-    """The value of ``--name VALUE`` or ``--name=VALUE``, taken out of the words; empty where it is not given."""
-    for position, word in enumerate(words):
-        name, equals, value = word.partition("=")
-        if name not in names:
-            continue
-        del words[position]
-        if not equals:
-            if position == len(words):
-                raise InvalidInputError(f"{name} needs a value behind it, as in {name} VALUE")
-            value = words.pop(position)
-        return value
-    return ""
-
-
-def _flag(words: list[str], *names: str) -> bool:
-    """Whether a flag is among the words; takes it out."""
-    found = [word for word in words if word in names]
-    for word in found:
-        words.remove(word)
-    return bool(found)
 
 
 def _named(words: Sequence[str], keys: Sequence[str]) -> list[str]:
