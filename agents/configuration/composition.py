@@ -148,7 +148,7 @@ def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, com
                 f"{path}={as_command_line_text(value)}: {path} is a group of keys; give one of {keys}"
             )
         if find := field.metadata.get("kinds"):  # the name of a component decides which settings it has
-            hint = find(value.get("name", getattr(hint, "name", "")))
+            hint = find(value.get("name", getattr(field.default_factory, "name", "")))
         return build(hint, value, f"{path}.", command)
     return _scalar(hint, value, path)
 
