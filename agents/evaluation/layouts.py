@@ -279,20 +279,6 @@ class Support:
     catch: float = 0.0  # height error (m) up to which a rider within reach is assigned here; for thin supports
 
 
-@dataclass(frozen=True)
-class Container:
-    """Hollow assets, in which objects lie as they fell; these objects have no correct height and are left out.
-
-    >>> [container.names for container in CONTAINERS]
-    [('fruit_bowl',), ('bowl',), ('utensil_crock',)]
-    """
-
-    names: tuple[str, ...]
-    riders: tuple[str, ...]  # objects that may lie in them
-    reach: float  # largest horizontal distance (m) between the frames
-    depth: float  # largest height (m) of the rider's frame above the container's; the smallest is 1 cm
-
-
 _FRUIT = (
     "apple_gala", "apple_golden", "apple_green", "apple_red", "avocado_a", "avocado_b", "avocado_c", "pear_anjou",
     "pear_bosc", "pear_red",
@@ -349,12 +335,14 @@ SUPPORTS: dict[str, tuple[Support, ...]] = {
 }
 """Supports of each scene type, by name; scene types without an entry have no height figures."""
 
-CONTAINERS: tuple[Container, ...] = (
-    Container(("fruit_bowl",), _FRUIT, reach=0.11, depth=0.15),
-    Container(("bowl",), ("bread_slice",), reach=0.08, depth=0.10),
-    Container(("utensil_crock",), _UTENSILS, reach=0.10, depth=0.20),
+CONTAINERS = (
+    ("fruit_bowl", _FRUIT, 0.11, 0.15),
+    ("bowl", ("bread_slice",), 0.08, 0.10),
+    ("utensil_crock", _UTENSILS, 0.10, 0.20),
 )
-"""Containers of all scene types."""
+"""Hollow assets and the objects that may lie in them as they fell, which have no correct height and are left out; the
+largest horizontal distance (m) between the frames, and the largest height (m) of the object's frame above the
+container's. The smallest height is 1 cm."""
 
 
 def category_distribution(batch: SceneBatch, eps: float = KL_EPS) -> Tensor:
@@ -457,11 +445,10 @@ def _contained(batch: SceneBatch) -> Tensor:
     z = batch.translations[..., 2].double()
     rise = z.unsqueeze(2) - z.unsqueeze(1)  # (B, rider, container)
     inside = torch.zeros_like(batch.is_empty)
-    for container in CONTAINERS:
-        if not set(container.names) & set(batch.scene_type.assets):
-            continue
-        held = _near(batch, container.names, container.reach) & (rise > 0.01) & (rise <= container.depth)
-        inside |= held.any(dim=-1) & _is_one_of(batch, container.riders)
+    for name, riders, reach, depth in CONTAINERS:
+        if name in batch.scene_type.assets:
+            held = _near(batch, (name,), reach) & (rise > 0.01) & (rise <= depth)
+            inside |= held.any(dim=-1) & _is_one_of(batch, riders)
     return inside
 
 

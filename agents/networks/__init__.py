@@ -12,7 +12,6 @@ from agents.networks.baselines import (
 )
 from agents.networks.flux import FluxConfig, FluxDenoiser, MixedFlux, MixedFluxConfig
 from agents.networks.registry import (
-    NETWORKS,
     build_network,
     list_networks,
     network_config,
@@ -21,7 +20,6 @@ from agents.networks.registry import (
 from agents.networks.text import TextConfig, TextEncoder
 
 __all__ = [
-    "NETWORKS",
     "DiffuScene",
     "DiffuSceneConfig",
     "FluxConfig",

@@ -4,19 +4,13 @@ The *trunk* between inputs and outputs maps tokens (B, N, H), a time embedding (
 (B, 1, 1, L), both None without text, to tokens (B, N, H).
 
 MiDiffusion (Hu et al. 2024, "Mixed Diffusion for 3D Indoor Scene Synthesis", section on the denoising network) is a
-transformer over the objects of a scene, without positional encoding. Each object is a token, made of the embedding of
-its category and an MLP of its pose. Every block has self-attention among objects, cross-attention to the condition and
-a feed-forward layer, each behind a layer norm whose scale and shift are functions of time. Separate heads predict
-categories and poses. The paper's condition is a floor plan; here it is text, as in the comparison of Pfaff et al. (CoRL
-2025).
+transformer over the objects of a scene, without positional encoding, whose layer norms are functions of time. The
+paper's condition is a floor plan; here it is text, as in the comparison of Pfaff et al. (CoRL 2025).
 
 DiffuScene (Tang et al. 2024, "DiffuScene: Denoising Diffusion Models for Generative Indoor Scene Synthesis", section on
-the denoising network) is a U-Net of 1-D convolutions along the slots of a scene. MLPs that all objects share encode
-their attributes to channels and decode them. Between encoder and decoder there are residual blocks of convolutions, to
-which the time embedding is added. Each level has attention among slots and, with text, from slots to words. As in the
-U-Net of Ho et al. 2020, convolutions of stride 2 halve the resolution on the way down, and skip connections lead from
-each level on the way down to that on the way up. Convolutions mix neighbouring slots, so the network depends on the
-order of slots, although scenes have no order.
+the denoising network) is a U-Net of 1-D convolutions along the slots of a scene (Ho et al. 2020), with attention among
+slots and, with text, from slots to words at each level. Convolutions mix neighbouring slots, so the network depends on
+the order of slots, although scenes have no order.
 """
 
 from __future__ import annotations

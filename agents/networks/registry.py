@@ -12,8 +12,6 @@ from agents.configuration.composition import check_types
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.registry import load_plugins
 
-NETWORKS = ("flux", "midiffusion", "diffuscene")
-"""The Flux-style network, and the two that it is compared with."""
 NETWORK_PROCESSES = ("continuous", "mixed")
 """Processes that a network may denoise: scenes as numbers, or poses with discrete categories."""
 ENTRY_POINT_GROUP = "scene_envs.networks"
@@ -103,7 +101,8 @@ def network_config(
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0),
     rotations: tuple[tuple[float, ...], tuple[float, ...]] = ((1.0,) * 9, (0.0,) * 9),
 ) -> NetworkConfig:  # fmt: skip
-    """The size of a network from the keys that all networks share.
+    """The size of a network from the keys that all networks share; :class:`~agents.networks.MixedFluxConfig` describes
+    those that the mixed ``flux`` alone reads.
 
     Args:
         name: name of a network, see :func:`list_networks`.
@@ -114,15 +113,11 @@ def network_config(
         depth: number of blocks. Mixed ``flux`` with text has a third as many double-stream blocks in addition.
             ``diffuscene`` has a third as many residual blocks per level.
         heads: attention heads.
-        text_width: width of the text tokens; 0 for none. The continuous ``flux`` reads none.
-        frequencies: octaves of Fourier features, read by ``flux`` alone. The other networks have none, as published.
-        double_blocks: number of double-stream blocks of the mixed ``flux``; None for a third of ``depth``.
-        embedding: width of the slots of the mixed ``flux``; None for ``hidden``.
-        pose_head, time_scale, text_reach, unit, rotations: read by the mixed ``flux`` alone, see
-            :class:`~agents.networks.MixedFluxConfig`.
-        modules: modules of the mixed ``flux``, as :class:`~agents.networks.MixedFluxConfig` takes them, without the
-            Fourier features, which ``frequencies`` adds. All are put in the order of
-            :data:`~agents.networks.flux.MODULES`. None for the flags of inpainting alone.
+        text_width: width of the text tokens, 0 for none; read by mixed networks.
+        frequencies: octaves of Fourier features, read by ``flux`` alone.
+        double_blocks: None for a third of ``depth``.
+        embedding: None for ``hidden``.
+        modules: in any order, without the Fourier features; None for the flags of inpainting alone.
 
     Raises:
         UnknownNameError: no network or no process has that name.

@@ -15,7 +15,6 @@ from torch.nn import functional as F
 
 from agents import PretrainConfig
 from agents.networks import (
-    NETWORKS,
     DiffuSceneConfig,
     MiDiffusionConfig,
     MixedDiffuSceneConfig,
@@ -28,6 +27,7 @@ from agents.networks import (
 from agents.networks.flux_modules import CountConditioning, count_states, still_to_come
 from agents.networks.geometry import RelationsConfig
 from agents.networks.registry import config_from_state, config_state
+from agents.pretraining.settings import NETWORKS
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 FEATURES, CATEGORIES, TEXT = 20, 8, 12
