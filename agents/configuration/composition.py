@@ -77,9 +77,6 @@ def require_one_of(settings: Any, name: str, known: Sequence[str], what: str = "
 def check_types(kind: type, values: Mapping[str, Any]) -> None:
     """Refuse values of the wrong type for the fields of a dataclass that are numbers, texts or booleans.
 
-    Raises:
-        InvalidInputError: a value of another type; names the field.
-
     >>> from dataclasses import make_dataclass
     >>> check_types(make_dataclass("Size", [("depth", int)]), {"depth": "deep"})
     Traceback (most recent call last):
@@ -100,13 +97,8 @@ def check_types(kind: type, values: Mapping[str, Any]) -> None:
 
 
 def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: str = "") -> Config:
-    """An instance of the dataclass ``kind`` from a nested mapping; missing keys keep their defaults.
-
-    Args:
-        kind: a dataclass, whose groups are dataclasses as well.
-        tree: values by field name.
-        path: place of ``tree`` in messages, such as ``"optimizer."``.
-        command: name of the command in messages.
+    """An instance of the dataclass ``kind`` from a nested mapping; missing keys keep their defaults. ``path`` is the
+    place of ``tree`` in messages, such as ``"optimizer."``.
 
     Raises:
         UnknownNameError: a key that ``kind`` does not have; the nearest one is offered.
@@ -290,11 +282,8 @@ def nested(
 
 
 def named(default: Any, folder: str) -> Any:
-    """A field that names a component, or is a mapping with its ``name`` and settings.
-
-    Args:
-        default: name of the default component, or None.
-        folder: name of the group of options in Hydra: ``reward``, ``mask`` or ``scene``.
+    """A field that names a component, or is a mapping with its ``name`` and settings. ``folder`` is the group of
+    options in Hydra: ``reward``, ``mask`` or ``scene``.
     """
     return dataclasses.field(
         default=default, metadata={"folder": folder, "named": True, "registered": _REGISTERED[folder]}
@@ -349,11 +338,7 @@ def field_options(field: dataclasses.Field[Any], config_dir: str = "") -> list[s
 
 
 def check_option(folder: str, option: str, known: Sequence[str]) -> None:
-    """Refuse an option that a group does not have.
-
-    Raises:
-        UnknownNameError: names the nearest one.
-    """
+    """Refuse an option that a group does not have."""
     if option not in known:
         raise unknown_name(folder, option, known)
 
@@ -409,16 +394,8 @@ def _complete(kind: type, given: Mapping[str, Any], fields: Mapping[str, datacla
 
 
 def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: str = "") -> dict[str, Any]:
-    """Values of the options chosen, as Hydra composes them; interpolations are not resolved.
-
-    Args:
-        command: name of the command in messages.
-        kind: config dataclass, whose fields say which groups there are.
-        choices: options by field, besides ``recipe`` and ``+experiment``.
-        config_dir: folder with further groups and experiments.
-
-    Raises:
-        InvalidInputError: Hydra cannot read a file.
+    """Values of the options chosen, as Hydra composes them; interpolations are not resolved. ``choices`` are options by
+    field, ``recipe`` and ``+experiment``. An InvalidInputError if Hydra cannot read a file.
     """
     if not choices:
         return {}

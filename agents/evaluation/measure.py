@@ -119,21 +119,16 @@ def evaluate(
     pool: PhysicsPool | None = None,
     ready: bool = True,
 ) -> dict[str, float]:
-    """Sample a prior and measure its raw samples.
+    """Sample a prior and measure its raw samples: the figures of :func:`measure_samples`, and ``num_steps``.
 
     Args:
         prior: a prior, or the name or path of one.
         count: number of samples.
         reference: real scenes; None draws ``count`` scenes from the grammar of the prior's scene type.
-        floor: other real scenes, see :func:`measure_samples`.
         num_steps: denoiser evaluations per sample.
         seed: seed of the samples, and of the grammar if it is used.
         batch_size: number of scenes denoised at once.
-        pool: worker processes for physics; None computes in this process.
-        ready: whether to also project and settle the samples.
-
-    Returns:
-        The figures of :func:`measure_samples`, and ``num_steps``.
+        floor, pool, ready: as for :func:`measure_samples`.
     """
     sampler = cast(Sampler, resolve_prior(prior))
     if reference is None:
@@ -483,14 +478,10 @@ def _number(value: float | None) -> str:
 
 
 def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, float]:
-    """Share of scenes that follow their own prompt.
+    """Share of B scenes that follow their own one of B prompts, the paper's prompt-following accuracy.
 
-    This is the paper's prompt-following accuracy. A prompt is followed if every claim in it is true of the scene. The
-    numbers of the named objects must be exact. Relations have the tolerances in docs/prompts.md.
-
-    Args:
-        batch: B scenes.
-        prompts: B prompts that :func:`~scene_envs.datasets.parse_prompt` reads.
+    A prompt is followed if every claim in it is true of the scene. The numbers of the named objects must be exact.
+    Relations have the tolerances in docs/prompts.md.
 
     Returns:
         ``prompt_following``: share of all prompts followed. ``prompt_counts``, ``prompt_names`` and

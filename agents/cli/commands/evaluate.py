@@ -85,15 +85,8 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
 
 
 def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> list[str]:
-    """Names of groups, in their order.
-
-    Args:
-        measures: ``"all"``, a name, names joined by commas, or a list of names.
-        project: whether ``"all"`` includes ``ready``.
-
-    Raises:
-        UnknownNameError: a name that is no group.
-        InvalidInputError: no name, or something else than names.
+    """Names of groups, in their order, from ``"all"``, a name, names joined by commas, or a list of names; ``project``
+    says whether ``"all"`` includes ``ready``. An UnknownNameError for a name that is no group.
 
     >>> choose_measures("novelty, layout")
     ['layout', 'novelty']
@@ -191,10 +184,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
 
 def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
     """The identity of the figures in ``metrics.json``, and the figures by group, without groups of which a part was
-    left out; both empty where there are none.
-
-    Raises:
-        CorruptFileError: the file is cut off, or was changed after it was written.
+    left out; both empty where there are none. A CorruptFileError if the file is cut off or was changed.
     """
     try:
         found = dict(json.loads(path.read_text(encoding="utf-8"))).get("evaluation")
@@ -213,14 +203,8 @@ def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float
 class _Results:
     """Figures by group, written to ``metrics.json`` after each group, and the samples that they are of.
 
-    Figures in the folder are kept as far as they depend on the same ``identity``.
-
-    Args:
-        run: the run in whose folder they are.
-        identity: the keys, and the digest of the prior, on which the figures depend.
-
-    Raises:
-        InvalidInputError: the figures were measured with other keys; other keys of the prompts are allowed.
+    Figures in the folder of ``run`` are kept as far as they depend on the same ``identity``: keys, and the digest of
+    the prior. An InvalidInputError if they were measured with other keys; other keys of the prompts are allowed.
     """
 
     def __init__(self, run: Run, identity: dict[str, Any]) -> None:
