@@ -130,7 +130,7 @@ def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, com
                 f"{path}={as_command_line_text(value)[:60]} is neither a name nor a mapping with a name"
             )
         alone = isinstance(value, Mapping) and set(value) == {"name"}
-        return value["name"] if alone else plain_tree(value)
+        return value["name"] if alone else plain_tree(value) if isinstance(value, Mapping) else value
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             return value

@@ -242,17 +242,10 @@ def tallest_stacks(batch: SceneBatch) -> Tensor:
 
 
 def stack_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
-    """Wasserstein-1 distance of the tallest stack per scene, in objects.
+    """Wasserstein-1 distance of the tallest stack per scene from that of real scenes of the same assets, in objects.
 
     It shows whether stacks are lower than in real scenes, even if the number and categories of objects are those of
-    real scenes.
-
-    Args:
-        batch: the samples, at least one.
-        reference: real scenes of the same assets, at least one.
-
-    Raises:
-        InvalidInputError: the batches have other assets.
+    real scenes. An InvalidInputError if the batches have other assets.
 
     >>> stack_wasserstein(SceneBatch.empty("dimsum_table", 3), SceneBatch.empty("dimsum_table", 5))
     0.0

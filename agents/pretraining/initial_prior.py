@@ -299,7 +299,6 @@ def _conditions_counts(config: PretrainConfig) -> bool:
         config.text.vocabulary.count_conditioning
         and config.network.name == "flux"
         and config.text.encoder == VOCABULARY
-        and config.text.vocabulary.latents > 0
     )
 
 
