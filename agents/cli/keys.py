@@ -88,12 +88,8 @@ def describe_fields(config: type | Any) -> list[KeyHelp]:
 
 
 def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "") -> str:
-    """All keys with their values and meanings, a paragraph for each part and for each group with its options.
-
-    Args:
-        config: the config that ``words`` make, or its class.
-        words: options of groups among them stand in the headings.
-        config_dir: a folder with further options.
+    """All keys with their values and meanings, a paragraph for each part and for each group with its options; the
+    headings name those that ``words`` choose.
     """
     chosen = dict(word.partition("=")[::2] for word in words)
     sections = _sections(config)
@@ -177,12 +173,8 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
     Values are written as in Hydra: numbers, ``true``, ``null``, ``[1, 2]``, ``{name: clip, high: 20}``, ``${seed}``;
     the brackets of a list may be left out. The value of a key that takes one text is that text as it stands.
 
-    Args:
-        command: the command's name, for messages.
-        config: dataclass of its keys.
-        words: what was typed.
-        config_dir: folder with further groups and experiments; empty for none.
-        config_file: ``config.yaml`` whose values take the place of the defaults; empty for none.
+    ``config_dir`` is a folder with further groups and experiments, and the values of ``config_file`` take the place of
+    the defaults; empty for none.
 
     Raises:
         UnknownNameError: no such key or option; the nearest one is offered.
@@ -237,12 +229,7 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
 
 
 def read_config(path: str) -> dict[str, Any]:
-    """The values of a ``config.yaml``.
-
-    Raises:
-        InvalidInputError: there is no such file.
-        CorruptFileError: it holds no mapping.
-    """
+    """The values of a ``config.yaml``; an InvalidInputError without the file, a CorruptFileError without a mapping."""
     import yaml
 
     try:

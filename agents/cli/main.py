@@ -93,22 +93,15 @@ _GRAMMAR = "grammar"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status.
-
-    Args:
-        argv: the words after ``scene-envs``; those of the process by default.
-    """
+    """Run one command and return its exit status; ``argv`` are the words after ``scene-envs``, by default the process's."""
     return _guarded(list(sys.argv[1:] if argv is None else argv), _dispatch)
 
 
 def main_of(command: str, meaning: str, module: ModuleType, argv: Sequence[str] | None = None) -> int:
     """Run a program that consists of one command, and return its exit status.
 
-    Args:
-        command: its name in messages and in the name of its folder.
-        meaning: what it does, in one phrase.
-        module: has ``run(settings, run)``, as a module of :mod:`agents.cli.commands`.
-        argv: the words after the program; those of the process by default.
+    ``command`` is its name in messages and in the name of its folder, ``meaning`` what it does, in one phrase, and
+    ``module`` has ``run(settings, run)``, as those of :mod:`agents.cli.commands`.
     """
     return _guarded(
         list(sys.argv[1:] if argv is None else argv), lambda words: _run_or_help(command, meaning, module, words)
@@ -159,10 +152,8 @@ def _ended(status: int) -> int:
 
 
 def entry_point() -> None:
-    """Run as a program, in which idle threads of OpenMP sleep after a short wait unless the environment says otherwise.
-
-    By default idle threads wait busily. Where other work shares the cores, they take processor time away from the
-    threads for which they wait.
+    """Run as a program, in which idle threads of OpenMP sleep after a short wait unless the environment says otherwise:
+    threads that wait busily take processor time from those for which they wait, where other work shares the cores.
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)  # read when torch loads OpenMP

@@ -80,17 +80,16 @@ def check_types(kind: type, values: Mapping[str, Any]) -> None:
     >>> from dataclasses import make_dataclass
     >>> check_types(make_dataclass("Size", [("depth", int)]), {"depth": "deep"})
     Traceback (most recent call last):
-    scene_envs.errors.InvalidInputError: depth='deep' must be of type int
+    scene_envs.errors.InvalidInputError: depth=deep is not a whole number
     """
     for name, wanted in get_type_hints(kind).items():
         plain = set(get_args(wanted) if get_origin(wanted) in (Union, types.UnionType) else (wanted,))
         if name not in values or not plain <= {int, float, str, bool, NoneType}:
             continue
         value = values[name]
-        fits = any(type(value) is one or (one is float and type(value) is int) for one in plain)
+        fits = type(value) in plain or (float in plain and type(value) is int)
         if not fits or (isinstance(value, float) and not math.isfinite(value)):
-            expected = " or ".join(sorted("null" if one is NoneType else one.__name__ for one in plain))
-            raise InvalidInputError(f"{name}={str(value)[:100]!r} must be of type {expected}")
+            _refuse(wanted, value, name)
 
 
 # Dataclasses from nested mappings and back

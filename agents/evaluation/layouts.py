@@ -45,22 +45,13 @@ _WAVES = 12
 
 
 def spacing_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float | None:
-    """Distance of the distributions of distances between neighbours from those of real scenes, m.
+    """Distance of the distributions of distances between neighbours from those of real scenes of the same assets, m.
 
     For each ordered pair of assets (a, b), the horizontal distances from the free objects a to the nearest free object
     b at the same height form a distribution. The figure is the Wasserstein-1 distance of samples and reference, as a
     mean over the pairs, weighted by their number of distances in the reference. It shows whether objects are pushed
-    apart or crowded, even if their number and categories are those of real scenes.
-
-    Args:
-        batch: the samples.
-        reference: real scenes of the same assets.
-
-    Returns:
-        The distance in m; None if no pair of assets has 30 distances in both batches.
-
-    Raises:
-        InvalidInputError: the batches have other assets.
+    apart or crowded, even if their number and categories are those of real scenes. None if no pair of assets has 30
+    distances in both batches; an InvalidInputError if the batches have other assets.
 
     >>> spacing_wasserstein(SceneBatch.empty("dimsum_table", 3), SceneBatch.empty("dimsum_table", 5)) is None
     True
@@ -138,14 +129,10 @@ def nearest_scenes(batch: SceneBatch, others: SceneBatch, *, candidates: int = C
 
 
 def novelty(samples: Neighbors, real: Neighbors) -> float:
-    """Median distance of samples to their nearest training scene, over that of held-out real scenes.
+    """Median distance of samples to their nearest training scene, over that of held-out ``real`` scenes to theirs.
 
     At least 1 for samples that are as new as real scenes, 0 for copies; infinite when the held-out scenes are copies
     of training scenes themselves and the samples are not.
-
-    Args:
-        samples: nearest training scenes of the samples.
-        real: nearest training scenes of held-out real scenes, from the same training scenes.
     """
     above, below = float(samples.distance.median()), float(real.distance.median())
     return above / below if below > 0 else (1.0 if above == 0 else math.inf)

@@ -38,10 +38,7 @@ def frechet_scene_distance(a: SceneBatch, b: SceneBatch, *, encoder: SetEncoder 
     Args:
         a: scenes.
         b: scenes of the same type, or of another one; categories are matched by asset name.
-        encoder: encoder of the features; None takes the shipped one.
-
-    Returns:
-        The distance, at least 0, in units of the encoder's whitened features.
+        encoder: encoder of the features; None takes the shipped one. The distance is in units of its whitened features.
 
     Raises:
         InvalidInputError: a batch has fewer than two scenes.
@@ -106,9 +103,6 @@ def frechet_inception_distance(
         width: width of the renders in pixels; they are then scaled to 299 x 299.
         height: height of the renders in pixels.
         batch_size: number of images per forward pass.
-
-    Returns:
-        The distance, at least 0.
 
     Raises:
         MissingDependencyError: torchvision is not installed.

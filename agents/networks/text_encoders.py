@@ -45,11 +45,8 @@ class Bert(NamedTuple):
 
 @lru_cache(maxsize=4)
 def load_bert(model: str, device: str = "cpu") -> Bert:
-    """The frozen model at ``model``, loaded once per process and device; only local files are read.
-
-    Args:
-        model: folder, or name on the hub of a model in the local cache.
-        device: torch device.
+    """The frozen model in the folder ``model``, or of that name on the hub and in the local cache, loaded once per
+    process and device; only local files are read.
 
     Raises:
         MissingDependencyError: ``transformers`` is not installed.
@@ -162,15 +159,8 @@ class BertTextConfig:
 
     @classmethod
     def from_model(cls, model: str | os.PathLike[str], *, download: bool = False) -> BertTextConfig:
-        """The config of a model at hand.
-
-        Args:
-            model: folder with the model, or its name on the hub, which is looked for in the local cache.
-            download: whether a hub model that is not in the cache is downloaded.
-
-        Raises:
-            MissingDependencyError: ``transformers`` is not installed.
-            InvalidInputError: no such model at hand, or not a BERT.
+        """The config of the model that :func:`load_bert` finds; ``download`` first fetches a hub model that is not in
+        the local cache. Errors as for :func:`load_bert`.
         """
         name = os.path.abspath(model) if Path(model).is_dir() else str(model)
         if download and not os.path.isdir(name):
