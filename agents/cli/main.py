@@ -93,7 +93,7 @@ _GRAMMAR = "grammar"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status; ``argv`` are the words after ``scene-envs``, by default the process's."""
+    """Run one command and return its exit status; ``argv`` replaces the words of the process after ``scene-envs``."""
     return _guarded(list(sys.argv[1:] if argv is None else argv), _dispatch)
 
 
