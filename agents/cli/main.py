@@ -94,7 +94,7 @@ _GRAMMAR = "grammar"
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status; ``argv`` replaces the words of the process after ``scene-envs``."""
-    return _guarded(list(sys.argv[1:] if argv is None else argv), _dispatch)
+    return _guarded(argv, _dispatch)
 
 
 def main_of(command: str, meaning: str, module: ModuleType, argv: Sequence[str] | None = None) -> int:
@@ -103,13 +103,12 @@ def main_of(command: str, meaning: str, module: ModuleType, argv: Sequence[str] 
     ``command`` is its name in messages and in the name of its folder, ``meaning`` what it does, in one phrase, and
     ``module`` has ``run(settings, run)``, as those of :mod:`agents.cli.commands`.
     """
-    return _guarded(
-        list(sys.argv[1:] if argv is None else argv), lambda words: _run_or_help(command, meaning, module, words)
-    )
+    return _guarded(argv, lambda words: _run_or_help(command, meaning, module, words))
 
 
-def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
+def _guarded(argv: Sequence[str] | None, work: Callable[[list[str]], int]) -> int:
     """The exit status of ``work``, whose errors become one paragraph on stderr."""
+    words = list(sys.argv[1:] if argv is None else argv)
     show_traceback = os.environ.get("SCENE_ENVS_TRACEBACK", "") not in ("", "0")
     if "--traceback" in words:
         show_traceback = True
@@ -126,10 +125,6 @@ def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as in `scene-envs rewards | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
-    except RecursionError as error:
-        if show_traceback:
-            traceback.print_exc()
-        return _complain(f"a value or a file is nested too deeply ({_cut(error)}); write it flatter", WRONG_INPUT)
     except Exception as error:
         if show_traceback:
             traceback.print_exc()
@@ -242,6 +237,8 @@ def _verdict(error: Exception) -> tuple[str, int]:
     """The message for the user, and the exit status."""
     if isinstance(error, InvalidInputError | UnknownNameError | CorruptFileError):
         return str(error), WRONG_INPUT
+    if isinstance(error, RecursionError):
+        return f"a value or a file is nested too deeply ({_cut(error)}); write it flatter", WRONG_INPUT
     if isinstance(error, SceneEnvsError):
         return str(error), FAILED
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):

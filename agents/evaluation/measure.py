@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -38,6 +38,7 @@ from scene_envs.datasets.prompts import KINDS, describe, parse_prompt, scene_fac
 from scene_envs.datasets.prompts.claims import NameCount, ObjectCount
 from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.protocols import PriorLike
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
@@ -52,17 +53,6 @@ _FLOOR_SEED = 1_000_003
 """Added to the seed of the grammar for the second set of scenes."""
 
 Figures = dict[str, float]
-
-
-class Sampler(Protocol):
-    """Protocol of the priors that :func:`evaluate` takes, such as ``agents.priors.prior.ScenePrior``."""
-
-    @property
-    def scene_type(self) -> SceneType: ...
-
-    def sample(
-        self, count: int, *, num_steps: int = ..., slots: int | None = ..., seed: int = ..., batch_size: int = ...
-    ) -> SceneBatch: ...
 
 
 def measure_samples(
@@ -108,7 +98,7 @@ def measure_samples(
 
 
 def evaluate(
-    prior: Sampler | str,
+    prior: PriorLike | str,
     count: int = 500,
     reference: SceneBatch | None = None,
     *,
@@ -122,7 +112,7 @@ def evaluate(
     """Sample a prior and measure its raw samples: the figures of :func:`measure_samples`, and ``num_steps``.
 
     Args:
-        prior: a prior, or the name or path of one.
+        prior: a prior with a method ``sample``, or the name or path of one.
         count: number of samples.
         reference: real scenes; None draws ``count`` scenes from the grammar of the prior's scene type.
         num_steps: denoiser evaluations per sample.
@@ -130,7 +120,7 @@ def evaluate(
         batch_size: number of scenes denoised at once.
         floor, pool, ready: as for :func:`measure_samples`.
     """
-    sampler = cast(Sampler, resolve_prior(prior))
+    sampler: Any = resolve_prior(prior)
     if reference is None:
         reference = grammar_scenes(sampler.scene_type, count, seed=seed)
     samples = sampler.sample(count, num_steps=num_steps, seed=seed, batch_size=batch_size)
