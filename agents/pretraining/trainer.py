@@ -99,6 +99,7 @@ class Pretrainer:
         self.schedule = self._schedule()
         self.seconds = 0.0
         self.directory = config.directory
+        self.checkpoint_path = self.directory / "checkpoint.pt"
         chosen = config.logger.name if self.processes.is_first else "csv"
         self.logger = RunLogger(chosen, self.directory)
         self.history: list[dict[str, float]] = []  # the rows of log.csv
@@ -108,11 +109,6 @@ class Pretrainer:
     def evaluations(self) -> list[dict[str, float]]:
         """Losses on held-out scenes, each with its step."""
         return [{"step": row["step"], "heldout": row["heldout"]} for row in self.history if "heldout" in row]
-
-    @property
-    def checkpoint_path(self) -> Path:
-        """File of the resumable state."""
-        return self.directory / "checkpoint.pt"
 
     def run(self) -> ScenePrior:
         """Train to ``config.iterations`` and return the averaged prior; writes it to ``output/prior``."""
