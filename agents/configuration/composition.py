@@ -129,7 +129,7 @@ def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, com
                 f"{path}={as_command_line_text(value)[:60]} is neither a name nor a mapping with a name"
             )
         alone = isinstance(value, Mapping) and set(value) == {"name"}
-        return value["name"] if alone else plain_tree(value) if isinstance(value, Mapping) else value
+        return value["name"] if alone else plain_tree(value)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             return value
@@ -150,14 +150,20 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
     >>> changed(RewardLimitKeys(), {"reward_limits.timeout": 3})
     RewardLimitKeys(reward_limits=RewardLimits(timeout=3.0, memory=1.0))
     """
-    values: dict[str, Any] = {}
+    whole: dict[str, Any] = {}
+    parts: dict[str, Any] = {}
     for key, value in changes.items():
         head, *inner = key.split(".")
+        if not hasattr(config, head):
+            raise unknown_name("key", key, dotted_values(config))
+        if not inner:
+            whole[head] = value
+            continue
         for part in reversed(inner):
             value = {part: value}
-        before = plain_tree(values.get(head, getattr(config, head, None))) if inner else None
-        values[head] = merged(before, value) if isinstance(before, Mapping) else value
-    return dataclasses.replace(config, **field_values(type(config), values))  # type: ignore[type-var]
+        before = plain_tree(parts.get(head, whole.get(head, getattr(config, head))))
+        parts[head] = merged(before, value) if isinstance(before, Mapping) else value
+    return dataclasses.replace(config, **{**whole, **field_values(type(config), parts)})  # type: ignore[type-var]
 
 
 def dotted_values(config: Any) -> dict[str, Any]:
