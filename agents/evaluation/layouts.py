@@ -369,8 +369,14 @@ def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) 
         return {}
     errors: dict[str, list[Tensor]] = {support.kind: [] for support in supports}
     for start in range(0, len(batch), _CHUNK):
-        for kind, error in _chunk_errors(batch[start : start + _CHUNK], supports):
-            errors[kind].append(error)
+        chunk = batch[start : start + _CHUNK]
+        gaps = torch.stack([_height_gap(chunk, support) for support in supports])  # (S, B, N)
+        catch = torch.tensor([support.catch for support in supports]).to(gaps)[:, None, None]
+        nearest = (gaps - 1.0 * ((gaps <= catch) & (catch > 0))).argmin(dim=0)
+        error = gaps.gather(0, nearest[None])[0]
+        supported = torch.isfinite(error) & ~_contained(chunk)
+        for index, support in enumerate(supports):
+            errors[support.kind].append(error[supported & (nearest == index)])
     return {kind: torch.cat(parts) if parts else torch.empty(0) for kind, parts in errors.items()}
 
 
@@ -386,15 +392,6 @@ def out_of_workspace_rate(batch: SceneBatch) -> float:
     """Share of the free objects whose frame is outside the workspace; 0 where there are none."""
     free = batch.is_free
     return int((free & ~batch.in_workspace).sum()) / max(int(free.sum()), 1)
-
-
-def _chunk_errors(batch: SceneBatch, supports: Sequence[Support]) -> list[tuple[str, Tensor]]:
-    gaps = torch.stack([_height_gap(batch, support) for support in supports])  # (S, B, N)
-    catch = torch.tensor([support.catch for support in supports]).to(gaps)[:, None, None]
-    nearest = (gaps - 1.0 * ((gaps <= catch) & (catch > 0))).argmin(dim=0)
-    error = gaps.gather(0, nearest[None])[0]
-    supported = torch.isfinite(error) & ~_contained(batch)
-    return [(support.kind, error[supported & (nearest == index)]) for index, support in enumerate(supports)]
 
 
 def _height_gap(batch: SceneBatch, support: Support) -> Tensor:

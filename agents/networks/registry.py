@@ -81,10 +81,7 @@ def list_networks(process: str) -> list[str]:
 
 
 def build_network(config: NetworkConfig) -> nn.Module:
-    """A network with fresh weights.
-
-    Raises:
-        InvalidInputError: ``config`` is not the configuration of a network.
+    """A network with fresh weights; an InvalidInputError if ``config`` is not the configuration of a network.
 
     >>> from agents.networks import MiDiffusionConfig
     >>> type(build_network(MiDiffusionConfig(features=20, hidden=32, depth=1))).__name__
@@ -145,11 +142,8 @@ def config_state(config: NetworkConfig) -> dict[str, Any]:
 
 
 def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
-    """Inverse of :func:`config_state`.
-
-    Raises:
-        UnknownNameError: no network or no process has that name.
-        InvalidInputError: fields are missing or not known; the message names them.
+    """Inverse of :func:`config_state`. An UnknownNameError if no network or no process has that name, an
+    InvalidInputError that names fields which are missing, not known, or of another type.
     """
     name = state.get("kind", "")
     kind = _entry(name, process).config

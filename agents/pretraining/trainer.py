@@ -123,7 +123,9 @@ class Pretrainer:
             (self.directory / "log.csv").unlink(missing_ok=True)  # it may hold rows beyond the checkpoint
             if self.history:
                 self._write_rows(self.history)
-        with finishing_steps() as end, self._progress() as progress:
+        shown = self.config.progress if self.processes.is_first else "none"
+        bar = Progress("pretraining", self.config.iterations, done=self.step, style=shown)
+        with finishing_steps() as end, bar as progress:
             for row in self._steps(end):
                 if self.processes.is_first:
                     self._show(progress, row)
@@ -146,10 +148,6 @@ class Pretrainer:
         if warm_up_text(self.prior, self.data, steps, self.config.batch_size, self.config.seed) is not None:
             self.processes.share(self.network.parameters())
             self.average = WeightAverage(self.network, self.config.optimizer.ema)
-
-    def _progress(self) -> Progress:
-        style = self.config.progress if self.processes.is_first else "none"
-        return Progress("pretraining", self.config.iterations, done=self.step, style=style)
 
     def _show(self, progress: Progress, row: Mapping[str, float]) -> None:
         step, total = int(row["step"]), self.config.iterations

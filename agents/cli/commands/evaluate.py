@@ -142,7 +142,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
         )
         run.log(results.notes[-1])
     samples = results.scenes(_SAMPLES, lambda: draw(prior, settings, settings.count, batch_size=settings.batch_size))
-    _draw(samples, settings.pictures, run)
+    draw_scenes(samples, settings.pictures, run, "gallery.png")
     asked = settings.measures.split(",") if isinstance(settings.measures, str) else settings.measures
     optional = "all" in [str(name).strip() for name in asked]
     with make_pool(settings.workers, physics=settings.physics) as pool:
@@ -281,11 +281,3 @@ def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
 def _prompted(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str]) -> SceneBatch:
     guidance = {"guidance": settings.guidance, "claim_guidance": settings.claim_guidance}
     return draw(prior, settings, len(prompts), prompt=prompts, batch_size=settings.batch_size, **guidance)
-
-
-def _draw(samples: SceneBatch, count: int, run: Run) -> None:
-    """Draw ``gallery.png``, if there is geometry to draw."""
-    if not samples.scene_type.has_geometry:
-        run.log(f"no gallery: the assets of {samples.scene_type.name!r} have no geometry here")
-        return
-    draw_scenes(samples, count, run, "gallery.png")
