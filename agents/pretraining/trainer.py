@@ -283,6 +283,7 @@ class Pretrainer:
             )
         check_tensors(self.network, state["network"], self.checkpoint_path)
         try:
+            self.history = state["history"]
             self.network.load_state_dict(state["network"])
             self.average.restore(state["average"], state["average_updates"])
             self.optimizer.load_state_dict(state["optimizer"])
@@ -293,7 +294,6 @@ class Pretrainer:
             ) from error
         self.step, self.seconds = state["step"], state["seconds"]
         self.schedule = self._schedule()
-        self.history = state["history"]
         logger.info("resumed at step %d", self.step)
 
     def _data_facts(self) -> dict[str, Any]:
