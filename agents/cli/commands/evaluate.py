@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +17,6 @@ from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDepend
 from scene_envs.files import with_digest, without_digest, write_text
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from agents.priors.prior import ScenePrior
     from scene_envs.scene import SceneBatch
 
