@@ -198,10 +198,14 @@ def plain_tree(value: Any) -> Any:
 
 
 def config_text(values: Any) -> str:
-    """All keys as the ``config.yaml`` that ``--config`` reads; of a config, or of a nested mapping."""
+    """All keys as the ``config.yaml`` that ``--config`` reads, of a config or a nested mapping; a class's own keys come
+    before those of the classes that it extends.
+    """
     import yaml
 
-    return yaml.safe_dump(plain_tree(values), sort_keys=False)
+    tree = plain_tree(values)
+    own_first = [name for part in type(values).__mro__ for name in inspect.get_annotations(part) if name in tree]
+    return yaml.safe_dump({key: tree[key] for key in [*own_first, *tree]}, sort_keys=False)
 
 
 def _scalar(hint: Any, value: Any, path: str) -> Any:
