@@ -36,9 +36,9 @@ from agents.post_training.settings import PostTrainConfig
 from agents.priors.prior import ScenePrior, check_object_count, no_text
 from agents.utils.checkpoints import check_tensors, save_checkpoint
 from agents.utils.interrupts import finishing_steps
-from agents.utils.loggers import make_logger
+from agents.utils.loggers import RunLogger
 from agents.utils.process_group import ProcessGroup, launched_processes
-from agents.utils.weight_average import AveragedWeights
+from agents.utils.weight_average import averaged_weights
 from rewards import reward_label
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed
@@ -157,7 +157,7 @@ class PostTrainer:
         self.rollbacks = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
-        self.logger = make_logger(config.logger.name if self.processes.is_first else "csv", self.directory)
+        self.logger = RunLogger(config.logger.name if self.processes.is_first else "csv", self.directory)
 
     def close(self) -> None:
         """Stop physics workers, if any, and close the logger."""
@@ -327,7 +327,7 @@ class PostTrainer:
         recent = [row["reward"] for row in self.history[since:] if math.isfinite(row["reward"])]
         reward = sum(recent) / len(recent) if recent else float("nan")
         scenes = gathered_scenes(batch)
-        with AveragedWeights(self.prior, self.learner.algorithm.average) as prior:
+        with averaged_weights(self.prior, self.learner.algorithm.average) as prior:
             reading = self.guard.check(prior, self.iteration, reward, realism(scenes), sample=sample)
             if reading.kept:
                 self._keep(prior)

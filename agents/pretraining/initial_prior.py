@@ -299,7 +299,6 @@ def _conditions_counts(config: PretrainConfig) -> bool:
         config.text.vocabulary.count_conditioning
         and config.network.name == "flux"
         and config.text.encoder == VOCABULARY
-        and config.text.vocabulary.latents > 0
     )
 
 
@@ -346,11 +345,7 @@ class SceneTable:
     def __init__(self, scenes: Tensor, prompts: Sequence[Sequence[str]] = ()) -> None:
         self.scenes = scenes
         self.prompts = prompts
-
-    @property
-    def size(self) -> int:
-        """Number of scenes, M."""
-        return len(self.scenes)
+        self.size = len(scenes)
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:
         """See :class:`TrainingData`."""
@@ -364,11 +359,7 @@ class UnionTable:
     def __init__(self, datasets: Sequence[SceneDataset], prior: ScenePrior) -> None:
         self.datasets = datasets
         self.prior = prior
-
-    @property
-    def size(self) -> int:
-        """Number of scenes of all types."""
-        return sum(len(dataset) for dataset in self.datasets)
+        self.size = sum(map(len, datasets))
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:
         """See :class:`TrainingData`."""
