@@ -176,10 +176,8 @@ class DenoisingPolicy(TensorDictModuleBase):
         return tensordict
 
 
-def gradient_weights(
-    stds: Tensor, *, min_std: float = 1e-2, skip_first: float = 0.0, weighting: str = "uniform"
-) -> Tensor:
-    """(S,) weight of every step in the policy gradient; 0 leaves a step out.
+def gradient_weights(stds: Tensor, *, min_std: float = 1e-2) -> Tensor:
+    """(S,) weight of every step in the policy gradient: 1, or 0 where the step is left out.
 
     A step whose sigma is below ``min_std`` is sampled with that sigma but excluded from the gradient. Its log-density
     is so steep that millimetres of noise outweigh the reward. (Raising the sigma of the *sampler* to ``min_std``
@@ -188,24 +186,16 @@ def gradient_weights(
     Args:
         stds: (S,) sigma of every step, normalised units.
         min_std: smallest sigma of a step in the gradient.
-        skip_first: fraction of the chain, from its noisy end, that stays out of the gradient.
-        weighting: ``"uniform"``, ``"std"`` (proportional to sigma) or ``"variance"`` (to sigma squared);
-            weights of the steps in the gradient have mean 1.
 
     >>> gradient_weights(torch.tensor([0.6, 0.2, 0.005, 0.0])).tolist()
     [1.0, 1.0, 0.0, 0.0]
     """
-    powers = {"uniform": 0.0, "std": 1.0, "variance": 2.0}
-    if weighting not in powers:
-        raise InvalidInputError(f"step_weighting={weighting!r} is not known; use one of {', '.join(powers)}")
     if min_std <= 0:
         raise InvalidInputError(f"min_std={min_std} must be positive: the last step is deterministic")
     taken = stds >= min_std
-    taken[: round(skip_first * len(stds))] = False
     if not bool(taken.any()):
         raise InvalidInputError(
-            f"no step is left in the policy gradient: min_std={min_std}, skip_first={skip_first}, "
-            f"and the sigmas of the chain are {[round(float(s), 4) for s in stds]}"
+            f"no step is left in the policy gradient: min_std={min_std}, and the sigmas of the chain are "
+            f"{[round(float(s), 4) for s in stds]}"
         )
-    weight = torch.where(taken, stds ** powers[weighting], torch.zeros_like(stds))
-    return weight / weight[taken].mean()
+    return taken.to(stds)
