@@ -54,6 +54,8 @@ _PROBED_WITH_PROMPTS = 8
 """The same number in a run that uses the prompts of its real scenes."""
 _PICTURED = 6
 """Number of the guard's samples that are kept for the report."""
+_STATE = ("iteration", "invalid_streak", "rollbacks", "seconds", "history")
+"""Attributes of a trainer that are kept in a checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -149,12 +151,9 @@ class PostTrainer:
         self.learner = Learner(
             policy, config.resolved_reward(), config.algorithm, config.optimizer, config.regularisation,
             batch_size=config.batch_size, slots=config.slots, prompt=config.prompt, workers=config.workers,
-            physics=config.physics,
-            seed=config.seed,
+            physics=config.physics, seed=config.seed,
         )  # fmt: skip
-        self.iteration = 0
-        self.invalid_streak = 0
-        self.rollbacks = 0
+        self.iteration = self.invalid_streak = self.rollbacks = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
         self.logger = make_logger(config.logger.name if self.processes.is_first else "csv", self.directory)
@@ -404,11 +403,7 @@ class PostTrainer:
             return
         state = {
             "config": self.plain,
-            "iteration": self.iteration,
-            "invalid_streak": self.invalid_streak,
-            "rollbacks": self.rollbacks,
-            "seconds": self.seconds,
-            "history": self.history,
+            **{name: getattr(self, name) for name in _STATE},
             "guard": self.guard.state(),
             "learner": self.learner.state(),
         }
@@ -419,9 +414,8 @@ class PostTrainer:
             write_log(self.directory, self.history)
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self.iteration, self.invalid_streak = state["iteration"], state["invalid_streak"]
-        self.rollbacks = state["rollbacks"]
-        self.seconds, self.history = state["seconds"], list(state["history"])
+        for name in _STATE:
+            setattr(self, name, state[name])
         self.guard.restore(state["guard"])
         check_tensors(self.prior, state["learner"]["prior"], self.directory / CHECKPOINT_NAME)
         self.learner.restore(state["learner"])

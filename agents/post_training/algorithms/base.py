@@ -39,21 +39,18 @@ class Algorithm(ABC):
         policy: reverse chain of the prior in training.
         advantage: module that writes the advantages which the loss reads; None where the scenes are not weighted.
         loss: torchrl loss whose gradient trains the prior.
+        average: averaged weights that are evaluated and saved; None evaluates and saves the weights in training.
     """
 
     policy: DenoisingPolicy
     advantage: TensorDictModuleBase | None = None
     loss: LossModule
+    average: WeightAverage | None = None
 
     @property
     def sampling_policy(self) -> DenoisingPolicy:
         """Policy that samples the scenes; the policy in training unless an algorithm keeps another."""
         return self.policy
-
-    @property
-    def average(self) -> WeightAverage | None:
-        """Averaged weights that are evaluated and saved; None evaluates and saves the weights in training."""
-        return None
 
     @abstractmethod
     def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
@@ -87,6 +84,8 @@ class AveragedSampler(Algorithm):
     :class:`~agents.utils.weight_average.WeightAverage`.
     """
 
+    average: WeightAverage
+
     def __init__(self, policy: DenoisingPolicy, *, sampler_decay: float, warm_up: float = 10.0) -> None:
         self.policy = policy
         self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
@@ -95,36 +94,31 @@ class AveragedSampler(Algorithm):
             self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance,
             claim_guidance=policy.claim_guidance, independent=False,
         )  # fmt: skip  # it needs no log-probabilities
-        self._average = WeightAverage(self.prior, sampler_decay, warm_up)
+        self.average = WeightAverage(self.prior, sampler_decay, warm_up)
 
     @property
     def sampling_policy(self) -> DenoisingPolicy:
         """The reverse chain of the copy that samples."""
         return self._sampling_policy
 
-    @property
-    def average(self) -> WeightAverage:
-        """The weights of the copy that samples."""
-        return self._average
-
     def end_iteration(self) -> None:
         """Move the copy towards the prior in training."""
-        self._average.update(self.prior)
-        self._average.copy_to(self.sampler)
+        self.average.update(self.prior)
+        self.average.copy_to(self.sampler)
 
     def return_to(self, prior: ScenePrior) -> None:
         """Sample with the weights of ``prior``, and begin their average anew."""
-        self._average = WeightAverage(prior, self._average.decay, self._average.warm_up)
-        self._average.copy_to(self.sampler)
+        self.average = WeightAverage(prior, self.average.decay, self.average.warm_up)
+        self.average.copy_to(self.sampler)
 
     def state(self) -> dict[str, Any]:
         """The weights of the copy, and the number of their updates."""
-        return {"sampler": self._average.tensors, "updates": self._average.updates}
+        return {"sampler": self.average.tensors, "updates": self.average.updates}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
-        self._average.restore(state["sampler"], state["updates"])
-        self._average.copy_to(self.sampler)
+        self.average.restore(state["sampler"], state["updates"])
+        self.average.copy_to(self.sampler)
 
 
 def accepted_keys(*names: str, **keys: str) -> type:
