@@ -18,7 +18,6 @@ import numpy as np
 import torch
 
 from agents.planning.ledger import PlanResult
-from agents.planning.settings import SearchConfig
 from scene_envs.envs import SearchState
 from scene_envs.errors import CorruptFileError
 from scene_envs.files import finite, page_part, page_template, write_json, write_text
@@ -178,52 +177,15 @@ def loss_of(plan: PlanResult) -> float:
     return -plan.best_value if math.isfinite(plan.best_value) else math.inf
 
 
-def search_metrics(
-    objective: Any,
-    scale: float,
-    config: SearchConfig,
-    searches: Sequence[PlanResult],
-    best_of: PlanResult | None,
-    firsts: dict[int, SearchState],
-    seconds: dict[str, float],
-    stopped: str,
-    spent: int,
-    from_scenes: bool,
-) -> dict[str, Any]:
-    """The figures of a run that generated ``spent`` scenes; ``stopped`` says why it ended early, and may be empty.
-    ``firsts`` has the best of the first samples of each search, or its start scene, by the seed of the search.
-    """
-    search = min(searches, key=loss_of)
-    first = firsts[search.best_state.seed]
-    metrics = {
-        "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", repr(objective)),
-        "objective_scale": scale,
-        "saturated": search.best_state.objective > scale,
-        "below_zero": search.best_state.objective < 0,
-        "planner": config.planner.name,
-        "stopped": stopped or None,
-        "nfe": spent * config.nfe_per_scene,
-        "start" if from_scenes else "first_samples": _of_state(first),
-        "search": _of_plan(search),
-        "seconds": {name: round(value, 2) for name, value in seconds.items()},
-    }
-    if len(searches) > 1:
-        metrics["searches"] = [
-            _of_plan(plan) | ({"start": _of_state(firsts[plan.best_state.seed])} if from_scenes else {})
-            for plan in searches
-        ]
-    if best_of is not None:
-        metrics["best_of"] = _of_plan(best_of)
-    return metrics
-
-
-def _of_state(state: SearchState) -> dict[str, float | None]:
+def figures_of(state: SearchState) -> dict[str, float | None]:
+    """Φ and the raw objective of a state; None if it could not be scored."""
     return {"value": state.value, "objective": state.objective} if state.valid else {"value": None, "objective": None}
 
 
-def _of_plan(plan: PlanResult) -> dict[str, Any]:
+def plan_figures(plan: PlanResult) -> dict[str, Any]:
+    """The figures of a plan for ``metrics.json``."""
     return {
-        **_of_state(plan.best_state),
+        **figures_of(plan.best_state),
         "path": list(plan.best_path),
         "expansions": len(plan.values),
         "invalid": sum(map(math.isnan, plan.values)),

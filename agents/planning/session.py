@@ -189,14 +189,6 @@ class Lane:
         """The root of the plan."""
         return self.root
 
-    def legal_actions(self, state: Any) -> Sequence[int]:
-        """Actions that can be expanded from ``state``."""
-        return self.problem.legal_actions(state)
-
-    def evaluate(self, state: Any) -> float:
-        """The objective of ``state``, in [0, 1]."""
-        return self.problem.evaluate(state)
-
     def expand_batch(self, pairs: Pairs, steering: Any = None) -> list[Any]:
         """The child of every pair; raises SearchStoppedError when the budget is spent or the session ends."""
         if len(self.values) + len(pairs) > self.budget:
