@@ -47,8 +47,8 @@ def parse_adapters(spec: AdapterSpec) -> list[AdapterTerm]:
 
 def merge_adapters(base: StoredPrior, name: str, terms: Sequence[AdapterTerm]) -> StoredPrior:
     """The prior ``base``, called ``name``, with the updates of ``terms`` added to its weights, which are fine-tuned
-    priors that were all trained from it. The update of a fine-tuned prior is its weights minus those of ``base`` (task arithmetic,
-    Ilharco et al. 2023). An InvalidInputError if nothing is at a path, or an adapter is of another prior; a
+    priors that were all trained from it. The update of a fine-tuned prior is its weights minus those of ``base`` (task
+    arithmetic, Ilharco et al. 2023). An InvalidInputError if nothing is at a path, or an adapter is of another prior; a
     CorruptFileError if the files of an adapter are not those of a prior.
     """
     read = [(term, read_stored(term.path)) for term in terms]
