@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, make_dataclass
 from typing import Any, ClassVar
@@ -163,36 +163,27 @@ class PlainLoss(LossModule):
         return found
 
 
-class GradientSum:
-    """Sum of the ``.grad`` of parts of a batch, each complete before it is added; a gradient that is there already is
-    the first part. The sum of two parts is the same, bit for bit, in one process as in two with one part each.
+def in_parts(parameters: Iterable[nn.Parameter], count: int, chunk: int | None) -> Iterator[slice]:
+    """Rows of ``count`` scenes, ``chunk`` at a time (None: all), to put the gradient of each part into ``.grad``. At
+    the end ``.grad`` has the sum of the parts and of what was there before. Each part is complete before it is added,
+    so the sum of two is the same, bit for bit, in one process as in two with one part each.
 
     >>> weight = nn.Parameter(torch.ones(1))
-    >>> total = GradientSum([weight])
-    >>> for factor in (2.0, 3.0):
-    ...     (factor * weight).sum().backward()
-    ...     total.add_part()
-    >>> total.write()
+    >>> for rows in in_parts([weight], count=4, chunk=2):
+    ...     (weight * torch.arange(4.0)[rows]).sum().backward()
     >>> weight.grad
-    tensor([5.])
+    tensor([6.])
     """
-
-    def __init__(self, parameters: Iterable[nn.Parameter]) -> None:
-        self._parameters = [p for p in parameters if p.requires_grad]
-        self._total: list[Tensor | None] = [None] * len(self._parameters)
-        self.add_part()
-
-    def add_part(self) -> None:
-        """Add ``.grad`` to the sum, and clear it."""
-        for index, parameter in enumerate(self._parameters):
-            before, gradient = self._total[index], parameter.grad
-            self._total[index] = before if gradient is None else gradient if before is None else before.add_(gradient)
+    trained = [p for p in parameters if p.requires_grad]
+    total = [p.grad for p in trained]
+    for start in range(0, count, chunk or count):
+        for parameter in trained:
             parameter.grad = None
-
-    def write(self) -> None:
-        """Put the sum into ``.grad``."""
-        for parameter, total in zip(self._parameters, self._total, strict=True):
-            parameter.grad = total
+        yield slice(start, min(start + (chunk or count), count))
+        for index, (before, gradient) in enumerate(zip(total, [p.grad for p in trained], strict=True)):
+            total[index] = before if gradient is None else gradient if before is None else before.add_(gradient)
+    for parameter, gradient in zip(trained, total, strict=True):
+        parameter.grad = gradient
 
 
 def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:

@@ -12,9 +12,9 @@ from agents.post_training.algorithms.base import (
     Advantage,
     Algorithm,
     BatchGradient,
-    GradientSum,
     PlainLoss,
     accepted_keys,
+    in_parts,
 )
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.settings import DDPOISSettings, DDPOSFSettings
@@ -224,12 +224,9 @@ def accumulate_policy_gradient(
     """
     total, largest, clipped = 0.0, 0.0, 0.0
     valid = batch["valid"][:, -1, 0]
-    size = loss.policy.chunk or len(valid)
     processes = ProcessGroup.current()
     valid_count = max(1.0, processes.sum_numbers(int(valid.sum()))[0])
-    gradient = GradientSum(loss.policy.parameters())
-    for start in range(0, len(valid), size):
-        rows = slice(start, min(start + size, len(valid)))
+    for rows in in_parts(loss.policy.parameters(), len(valid), loss.policy.chunk):
         share = int(valid[rows].sum()) / valid_count  # turns a chunk's mean into its part of the batch's mean
         for step in steps if share else ():
             result = loss(batch[rows, step])
@@ -238,7 +235,5 @@ def accumulate_policy_gradient(
             total += float(objective.detach())
             largest = max(largest, float(result["log_ratio"]))
             clipped += float(result["clip_fraction"]) * share / len(steps)
-        gradient.add_part()
-    gradient.write()
     total, clipped = processes.sum_numbers(total, clipped)
     return BatchGradient(total, {"log_ratio": processes.largest(largest), "clip_fraction": clipped})

@@ -16,9 +16,9 @@ from agents.post_training.algorithms.base import (
     AveragedSampler,
     BatchGradient,
     ForwardAdvantage,
-    GradientSum,
     PlainLoss,
     accepted_keys,
+    in_parts,
 )
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import finished_scenes
@@ -314,15 +314,13 @@ class ForwardProcess(AveragedSampler):
         """
         x0 = self.prior.encode(finished_scenes(batch).to(self.prior.device))
         scenes = batch.exclude("next", "timestep")[:, -1].set("scene", x0)
-        size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
+        processes = ProcessGroup.current()
         valid = max(1.0, processes.sum_numbers(int(scenes["valid"].sum()))[0])
         everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
         draws = [self.prior.noised(everything, generator).rows(own) for _ in range(self.settings.draws)]
         total, squares = 0.0, 0.0
         learned = [] if self.expectation is None else self.expectation.trained
-        gradient = GradientSum([*self.prior.parameters(), *learned])
-        for start in range(0, len(x0), size):
-            rows = slice(start, start + size)
+        for rows in in_parts([*self.prior.parameters(), *learned], len(x0), self.policy.chunk):
             part = scenes[rows]
             share = int(part["valid"].sum()) / valid / self.settings.draws
             for noised in draws:
@@ -331,8 +329,6 @@ class ForwardProcess(AveragedSampler):
                 (objective + result["loss_expectation"] * share).backward()
                 total += float(objective.detach())
                 squares += share * float(result["distance"]) ** 2
-            gradient.add_part()
-        gradient.write()
         if self.expectation is not None:
             self.expectation.step()
         total, squares = processes.sum_numbers(total, squares)

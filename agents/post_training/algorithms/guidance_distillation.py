@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
-from agents.post_training.algorithms.base import AveragedSampler, BatchGradient, GradientSum, PlainLoss, accepted_keys
+from agents.post_training.algorithms.base import AveragedSampler, BatchGradient, PlainLoss, accepted_keys, in_parts
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import text_of
 from agents.post_training.settings import GuidanceDistillationSettings
@@ -137,16 +137,13 @@ class GuidanceDistillation(AveragedSampler):
             for _ in range(draws)
         ]
         states = [self.corrected(batch, steps[processes.rows(count)]) for steps in chosen]
-        size, total = self.policy.chunk or own, 0.0
-        gradient = GradientSum(self.prior.parameters())
-        for start in range(0, own, size):
+        total = 0.0
+        for rows in in_parts(self.prior.parameters(), own, self.policy.chunk):
             for state in states:
-                part = state[start : start + size]
+                part = state[rows]
                 objective = self.loss(part)["loss_objective"] * (len(part) / count / draws)
                 objective.backward()
                 total += float(objective.detach())
-            gradient.add_part()
-        gradient.write()
         moved, objects = (float(sum(state[name].sum() for state in states)) for name in ("moved", "trained"))
         total, moved, objects = processes.sum_numbers(total, moved, objects)
         return BatchGradient(total, {"correction_mm": 1e3 * moved / max(1.0, objects)})
