@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import heapq
 import itertools
 import json
@@ -20,7 +19,7 @@ import torch
 from agents.planning.ledger import PlanResult
 from scene_envs.envs import SearchState
 from scene_envs.errors import CorruptFileError
-from scene_envs.files import finite, page_part, page_template, write_json, write_text
+from scene_envs.files import finite, page_part, page_template, with_digest, without_digest, write_json, write_text
 from scene_envs.scene import SceneBatch
 
 MAX_PATH_SCENES = 60
@@ -85,13 +84,8 @@ class SearchRecord:
         best: Mapping[int, tuple[int, ...]],
         settings: Mapping[str, Any],
     ) -> SearchRecord:
-        """The record of searches that started from ``roots``.
-
-        Args:
-            roots: a state per search, each with a seed of its own.
-            states: all expanded states, in order.
-            best: path of the best state, by seed; the best search first.
-            settings: settings of the search; must contain ``nfe_per_scene``.
+        """The record of searches that started from ``roots``, which have a seed each. ``states`` are all expanded ones,
+        in order; ``best`` has the path of the best state by seed, the best search first.
         """
         rows: list[dict[str, Any]] = []
         ids: dict[tuple[int, tuple[int, ...]], int] = {}
@@ -139,8 +133,8 @@ class SearchRecord:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the record atomically, as JSON with a digest of its content."""
-        content = finite({**vars(self), "nodes": [asdict(node) for node in self.nodes]})
-        write_json(path, {"format": _FORMAT, "sha256": _digest(content), **content}, indent=None)
+        content = {"format": _FORMAT, **vars(self), "nodes": [asdict(node) for node in self.nodes]}
+        write_json(path, with_digest(content), indent=None)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SearchRecord:
@@ -153,23 +147,16 @@ class SearchRecord:
         text = Path(path).read_bytes()
         try:
             content = json.loads(text)
-            kind, digest = content.pop("format"), content.pop("sha256")
+            kind = content["format"]
         except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
             raise CorruptFileError(
                 f"{str(path)!r} is truncated or no search tree; run the search again with the same output to write it"
             ) from error
         if kind != _FORMAT:
             raise CorruptFileError(f"{str(path)!r} is {kind!r}, and {_FORMAT!r} is needed")
-        if digest != _digest(content):
-            raise CorruptFileError(
-                f"{str(path)!r} was changed after it was written; run the search again with the same output to write it"
-            )
+        content = without_digest(content, path)
         nodes = [TreeNode(**{**node, "mask": tuple(node["mask"])}) for node in content["nodes"]]
         return cls(content["settings"], content["searches"], nodes)
-
-
-def _digest(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=True).encode()).hexdigest()
 
 
 def loss_of(plan: PlanResult) -> float:

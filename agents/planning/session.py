@@ -250,14 +250,9 @@ class Session:
         *,
         root_counts: bool = False,
     ) -> list[PlanResult]:
-        """One plan of ``budget`` expansions per root.
-
-        Args:
-            planner: object with a method ``plan(problem, budget, progress)``.
-            roots: states that the plans start from.
-            budget: expansions of each plan.
-            progress: called with the expansions of all plans together, and with the lowest of the plans' best values.
-            root_counts: whether a root may be the best state of its plan.
+        """One plan of ``budget`` expansions per root, by the method ``plan(problem, budget, progress)`` of ``planner``.
+        ``progress`` is called with the expansions of all plans together and the lowest of their best values;
+        ``root_counts`` says whether a root may be the best state of its plan.
         """
         lanes = self.lanes = [Lane(self.problem, root, budget, self._expand, root_counts) for root in roots]
 

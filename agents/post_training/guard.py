@@ -89,15 +89,12 @@ class Guard:
 
     def _measure(self, prior: ScenePrior, sample: bool) -> tuple[float, dict[str, float]]:
         """The loss, and figures of samples if the guard samples; all processes get the values of the first process."""
-        check = self.samples if sample else None
-        batch = None if check is None else check.sample(prior)
-        if batch is not None:
-            self.last_samples = batch
-
-        def measured() -> tuple[float, dict[str, float]]:
-            return self.loss(prior), {} if check is None or batch is None else check.figures(batch)
-
-        return ProcessGroup.current().from_first(measured)
+        batch, check = None, self.samples
+        if sample and check is not None:
+            batch = self.last_samples = check.sample(prior)
+        return ProcessGroup.current().from_first(
+            lambda: (self.loss(prior), {} if check is None or batch is None else check.figures(batch))
+        )
 
     @torch.no_grad()
     def loss(self, prior: ScenePrior) -> float:
@@ -118,14 +115,9 @@ class Guard:
         *,
         sample: bool = True,
     ) -> GuardReading:
-        """Measure ``prior``; the reading says whether it is the best so far.
-
-        Args:
-            prior: prior with the weights that are evaluated and saved.
-            iteration: number of the finished iteration.
-            reward: mean over the batches since the check before.
-            realism: further figures, kept with the reading.
-            sample: whether this check samples; ignored if the guard never samples.
+        """Measure ``prior``, which has the weights that are evaluated and saved, after ``iteration`` iterations; the
+        reading says whether it is the best so far. ``reward`` is the mean over the batches since the check before,
+        ``realism`` has further figures for the reading, and ``sample`` says whether a guard that samples does so now.
         """
         loss, figures = self._measure(prior, sample)
         ratio = loss / self.base_loss

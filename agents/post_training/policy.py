@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -102,21 +102,14 @@ class DenoisingPolicy(TensorDictModuleBase):
     def distribution(self, x_t: Tensor, step: int, text: Text | None = None) -> ReverseStep:
         """p(x_{t-1} | x_t) of ``x_t`` (B, N, D) given ``text``; differentiable in the prior's parameters."""
         size = self.chunk or x_t.shape[0]
-        return concatenate_steps(
-            [
-                self._transition(x_t[rows], step, None if text is None else (text[0][rows], text[1][rows]))
-                for rows in (slice(start, start + size) for start in range(0, x_t.shape[0], size))
-            ]
-        )
-
-    def _transition(self, x_t: Tensor, step: int, text: Text | None) -> ReverseStep:
-        reverse: ReverseStep
-        if text is None:
-            reverse = self.prior.transition(x_t, step, self.table)
-        else:
-            prior = cast(PromptedPriorLike, self.prior)
-            reverse = prior.transition(x_t, step, self.table, text=text, guidance=self.guidance)
-        return reverse.independent() if self.independent and isinstance(reverse, MixedStep) else reverse
+        prior, parts = cast(PromptedPriorLike, self.prior), []
+        for rows in (slice(start, start + size) for start in range(0, x_t.shape[0], size)):
+            how: dict[str, Any] = (
+                {} if text is None else {"text": (text[0][rows], text[1][rows]), "guidance": self.guidance}
+            )
+            reverse: ReverseStep = prior.transition(x_t[rows], step, self.table, **how)
+            parts.append(reverse.independent() if self.independent and isinstance(reverse, MixedStep) else reverse)
+        return concatenate_steps(parts)
 
     @torch.no_grad()
     def draw(

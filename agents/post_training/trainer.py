@@ -104,7 +104,13 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     >>> len(result.history), result.history[0]["log_ratio"]
     (2, 0.0)
     """
-    _check_shares(config.batch_size, launched_processes())
+    if config.batch_size % (count := launched_processes()):
+        lower = config.batch_size // count * count
+        nearest = f"{lower} or {lower + count}" if lower else str(count)
+        raise InvalidInputError(
+            f"batch_size={config.batch_size} is not a multiple of {count}, the number of processes; give "
+            f"batch_size={nearest}, or another number of processes"
+        )
     processes = ProcessGroup.join(config.device)
     with claimed(config.directory, "post_train") if processes.is_first else nullcontext():
         trainer = PostTrainer(config, prior=prior)
@@ -114,23 +120,8 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
             trainer.close()
 
 
-def _check_shares(batch_size: int, processes: int) -> None:
-    if batch_size % processes:
-        lower = batch_size // processes * processes
-        nearest = f"{lower} or {lower + processes}" if lower else str(processes)
-        raise InvalidInputError(
-            f"batch_size={batch_size} is not a multiple of {processes}, the number of processes; give "
-            f"batch_size={nearest}, or another number of processes"
-        )
-
-
 class PostTrainer:
-    """One run: its loop, its guard and its files.
-
-    Args:
-        config: configuration of the run.
-        prior: prior to start from, instead of the one that ``config.prior`` names.
-    """
+    """One run: its loop, its guard and its files; ``prior`` is that to start from, None the one of ``config.prior``."""
 
     guard: Guard
     scenes: SceneBank
@@ -294,8 +285,14 @@ class PostTrainer:
         if row["valid_fraction"] > 0:
             self.invalid_streak = 0
             row |= self._learn(batch)
+        elif self.iteration == 0:
+            raise self._nothing_scored("no scene of the first batch")
         else:
-            self._count_invalid()
+            self.invalid_streak += 1
+            if self.invalid_streak >= MAX_INVALID:
+                raise self._nothing_scored(
+                    f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}"
+                )
         self.learner.learn_rewards(batch)
         self.iteration += 1
         return batch, row
@@ -338,15 +335,6 @@ class PostTrainer:
             self.rollbacks += 1
             self.learner.return_to(self._best())
             self.learner.regularisation.return_to_checkpoint(self.guard.best_ratio)
-
-    def _count_invalid(self) -> None:
-        self.invalid_streak += 1
-        if self.iteration == 0:
-            raise self._nothing_scored("no scene of the first batch")
-        if self.invalid_streak >= MAX_INVALID:
-            raise self._nothing_scored(
-                f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}"
-            )
 
     def _nothing_scored(self, what: str) -> TrainingError:
         return TrainingError(

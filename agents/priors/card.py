@@ -115,14 +115,9 @@ def prior_digest(prior: ScenePrior) -> str:
 
 
 def read_measures(path: str | os.PathLike[str]) -> tuple[dict[str, float], str | None]:
-    """The figures of ``scene-envs evaluate`` that are numbers, and the digest of the prior that was measured, if any.
-
-    Args:
-        path: ``metrics.json``, or the folder it is in.
-
-    Raises:
-        InvalidInputError: no such file, or no figure in it.
-        CorruptFileError: not JSON.
+    """The figures of ``scene-envs evaluate`` that are numbers, and the digest of the prior that was measured, if any,
+    from its ``metrics.json`` or the folder it is in. An InvalidInputError without such a file, or a figure in it; a
+    CorruptFileError if it is not JSON.
     """
     file = Path(path) / "metrics.json" if Path(path).is_dir() else Path(path)
     try:

@@ -37,15 +37,8 @@ _LIMITS = {"slots": 10_000, "num_timesteps": 1_000_000, "seed": 2**63}
 
 
 def to_precision(weights: Mapping[str, Tensor], precision: str) -> dict[str, Tensor]:
-    """Weights in the number format of a file; half precision keeps 11 bits, a relative error of at most 2^-11.
-
-    Args:
-        weights: trained tensors by name.
-        precision: ``"float32"`` or ``"float16"``.
-
-    Raises:
-        UnknownNameError: another format.
-        InvalidInputError: a weight beyond the range of the format (its tensor is named).
+    """Weights in the number format of a file, ``"float32"`` or ``"float16"``; half precision keeps 11 bits, a relative
+    error of at most 2^-11. An UnknownNameError for another format, an InvalidInputError for a weight beyond its range.
 
     >>> to_precision({"bias": torch.tensor([0.1])}, "float16")["bias"].dtype
     torch.float16
@@ -134,11 +127,8 @@ class StoredPrior:
 
 
 def read_stored(name: str | os.PathLike[str]) -> StoredPrior:
-    """The files of a shipped prior by name, or of one in a prior or run directory; its scene type is registered.
-
-    Raises:
-        UnknownNameError: no shipped prior has that name.
-        CorruptFileError: a file is truncated or not what its name says.
+    """The files of a shipped prior by name, or of one in a prior or run directory; its scene type is registered. Errors
+    are those of :func:`read_prior`.
     """
     state, tensors = read_prior(name)
     with explained(name):
@@ -283,10 +273,8 @@ class PriorFacts:
 
     @classmethod
     def of(cls, name: str | os.PathLike[str]) -> PriorFacts:
-        """The facts of a shipped prior, or of one in a prior or run directory; weights are not read.
-
-        Raises:
-            UnknownNameError, InvalidInputError, CorruptFileError: as :func:`agents.priors.files.read_prior`.
+        """The facts of a shipped prior, or of one in a prior or run directory; weights are not read. Errors are as for
+        :func:`read_prior`.
         """
         folder, state = find_prior(name), read_config(name)
         with explained(name):
