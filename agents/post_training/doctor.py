@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -109,11 +110,8 @@ def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> Doc
         real = config.regularisation
         bank = min(real.bank_size, config.guard.scenes + 4 * real.batch_size)
         small = changed(config, {"output": str(Path(scratch) / "run"), "regularisation.bank_size": bank})
-        trainer = PostTrainer(small, prior=prior)
-        try:
+        with closing(PostTrainer(small, prior=prior)) as trainer:
             return _examine(trainer)
-        finally:
-            trainer.close()
 
 
 def _examine(trainer: PostTrainer) -> DoctorReport:

@@ -418,9 +418,8 @@ def guard_sections(guard: Mapping[str, Any], pictures: Mapping[str, Path]) -> li
             limit = guard["sample_limits"].get(name)
             largest = "none" if limit is None else f"{base[name] + limit:.3g}"
             rows.append((label, *(f"{figures[name]:.3g}" for figures in (base, best, last)), largest))
-    within, beyond = pictures.get("guard_within"), pictures.get("guard_beyond")
-    shown = [Picture(within, "Of the prior kept")] if within else []
-    shown += [Picture(beyond, "Of the first check beyond a limit")] if beyond else []
+    captions = {"guard_within": "Of the prior kept", "guard_beyond": "Of the first check beyond a limit"}
+    shown = [Picture(pictures[name], caption) for name, caption in captions.items() if name in pictures]
     text = "Each check sampled from the same noise, and compared the samples with held-out real scenes."
     return [Section("What the guard sampled", text, shown, table=rows)]
 
@@ -429,12 +428,6 @@ def hold_sections(hold: Mapping[str, Any] | None, history: Sequence[Mapping[str,
     """A section on the target, with its picture written to ``path``; no section for a run without a target."""
     if hold is None or hold["measured"] is None:
         return []
-    caption = "The held-out loss with its target, and the weight of the regularisation over its first value."
-    picture = Picture(_draw(held_ratio(hold["target"]), history, path), caption)
-    return [Section("What was held", hold["verdict"], [picture])]
-
-
-def _draw(target: float, history: Sequence[Mapping[str, float]], path: Path) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -444,7 +437,7 @@ def _draw(target: float, history: Sequence[Mapping[str, float]], path: Path) -> 
     FigureCanvasAgg(figure)
     upper, lower = figure.subplots(2, 1, sharex=True)
     upper.plot(*zip(*measured, strict=True), ".-", color=GUARD_COLOR)
-    upper.axhline(target, color=FAINT, linestyle="--", linewidth=1)
+    upper.axhline(held_ratio(hold["target"]), color=FAINT, linestyle="--", linewidth=1)
     upper.set_ylabel("held-out loss over base")
     lower.semilogy(*zip(*weights, strict=True), color=REWARD_COLOR)
     lower.set_ylabel("factor on the weight")
@@ -453,7 +446,8 @@ def _draw(target: float, history: Sequence[Mapping[str, float]], path: Path) -> 
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=9)
     figure.savefig(path)
-    return path
+    caption = "The held-out loss with its target, and the weight of the regularisation over its first value."
+    return [Section("What was held", hold["verdict"], [Picture(path, caption)])]
 
 
 def number_rows(columns: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:

@@ -226,15 +226,11 @@ class PromptDeck:
 
     def deal(self, count: int, generator: Generator) -> list[str]:
         """``count`` prompts; neighbours share a prompt, in groups of ``share`` or a few more."""
-        groups = max(1, count // self.share)
-        different = [self._text(index, generator) for index in self._indices(groups, generator)]
-        return [different[row * groups // count] for row in range(count)]
-
-    def _indices(self, groups: int, generator: Generator) -> list[int]:
-        """Indices of prompts, without repetition while there are enough."""
-        size = len(self._texts) or self._count
+        groups, size = max(1, count // self.share), len(self._texts) or self._count
         rounds = [torch.randperm(size, generator=generator) for _ in range(-(-groups // size))]
-        return torch.cat(rounds)[:groups].tolist()  # type: ignore[no-any-return]
+        indices = torch.cat(rounds)[:groups].tolist()  # without repetition while there are enough
+        different = [self._text(index, generator) for index in indices]
+        return [different[row * groups // count] for row in range(count)]
 
     def _text(self, index: int, generator: Generator) -> str:
         if self._texts or self._real is None:

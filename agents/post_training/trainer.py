@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -112,12 +112,9 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
             f"batch_size={nearest}, or another number of processes"
         )
     processes = ProcessGroup.join(config.device)
-    with claimed(config.directory, "post_train") if processes.is_first else nullcontext():
-        trainer = PostTrainer(config, prior=prior)
-        try:
-            return trainer.run()
-        finally:
-            trainer.close()
+    claim = claimed(config.directory, "post_train") if processes.is_first else nullcontext()
+    with claim, closing(PostTrainer(config, prior=prior)) as trainer:
+        return trainer.run()
 
 
 class PostTrainer:

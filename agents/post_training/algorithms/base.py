@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, make_dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
@@ -47,9 +48,9 @@ class Algorithm(ABC):
     loss: LossModule
     average: WeightAverage | None = None
 
-    @property
+    @cached_property
     def sampling_policy(self) -> DenoisingPolicy:
-        """Policy that samples the scenes; the policy in training unless an algorithm keeps another."""
+        """Policy that samples the scenes; the policy in training unless an algorithm sets another."""
         return self.policy
 
     @abstractmethod
@@ -90,16 +91,11 @@ class AveragedSampler(Algorithm):
         self.policy = policy
         self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
         self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
-        self._sampling_policy = DenoisingPolicy(
+        self.sampling_policy = DenoisingPolicy(
             self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance,
             claim_guidance=policy.claim_guidance, independent=False,
         )  # fmt: skip  # it needs no log-probabilities
         self.average = WeightAverage(self.prior, sampler_decay, warm_up)
-
-    @property
-    def sampling_policy(self) -> DenoisingPolicy:
-        """The reverse chain of the copy that samples."""
-        return self._sampling_policy
 
     def end_iteration(self) -> None:
         """Move the copy towards the prior in training."""
