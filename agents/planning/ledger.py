@@ -234,12 +234,8 @@ class PlannerSettings:
 
     def make(self, branching: int) -> Any:
         """The planner: an object with ``plan(problem, budget, progress)``, as :class:`agents.planning.GreedyPlanner`.
-
-        Settings with a method ``plan`` are themselves the planner, with ``branching`` in place of null in the keys of
-        :data:`PER_STATE`.
-
-        Args:
-            branching: number of children of a state, which replaces null.
+        Settings with a method ``plan`` are themselves the planner, with ``branching``, the number of children of a
+        state, in place of null in the keys of :data:`PER_STATE`.
         """
         unset: dict[str, Any] = {name: branching for name in PER_STATE if getattr(self, name, branching) is None}
         return replace(self, **unset) if unset else self

@@ -224,27 +224,22 @@ ENTRY_POINT_GROUP = "scene_envs.algorithms"
 AlgorithmClass = TypeVar("AlgorithmClass", bound=type)
 
 
-@dataclass(frozen=True)
-class _Entry:
-    settings: type[AlgorithmSettings]
-    code: Any
-    """The class, or its ``module:class``, which is imported when it is needed."""
-
-
-_FORWARD = "agents.post_training.algorithms.forward_process:ForwardProcess"
-_ALGORITHMS = Registry(
+_FOLDER = "agents.post_training.algorithms"
+_ALGORITHMS: Registry[tuple[type[AlgorithmSettings], Any]] = Registry(
     "algorithm",
     ENTRY_POINT_GROUP,
     {
-        "ddpo_sf": _Entry(DDPOSFSettings, "agents.post_training.algorithms.ddpo:DDPO"),
-        "ddpo_is": _Entry(DDPOISSettings, "agents.post_training.algorithms.ddpo:DDPO"),
-        "guidance_distillation": _Entry(
-            GuidanceDistillationSettings, "agents.post_training.algorithms.guidance_distillation:GuidanceDistillation"
+        "ddpo_sf": (DDPOSFSettings, f"{_FOLDER}.ddpo:DDPO"),
+        "ddpo_is": (DDPOISSettings, f"{_FOLDER}.ddpo:DDPO"),
+        "guidance_distillation": (
+            GuidanceDistillationSettings,
+            f"{_FOLDER}.guidance_distillation:GuidanceDistillation",
         ),
-        "nft": _Entry(NFTSettings, _FORWARD),
-        "awm": _Entry(AWMSettings, _FORWARD),
+        "nft": (NFTSettings, f"{_FOLDER}.forward_process:ForwardProcess"),
+        "awm": (AWMSettings, f"{_FOLDER}.forward_process:ForwardProcess"),
     },
 )
+"""Settings and class of each algorithm; a class as ``module:class`` is imported when it is needed."""
 
 
 def register_algorithm(
@@ -263,7 +258,7 @@ def register_algorithm(
         InvalidInputError: the name is not one word.
     """
     _ALGORITHMS.check_name(name, "my_ddpo")
-    return _ALGORITHMS.adding(name, lambda algorithm: _Entry(settings, algorithm))
+    return _ALGORITHMS.adding(name, lambda algorithm: (settings, algorithm))
 
 
 def list_algorithms() -> list[str]:
@@ -273,12 +268,12 @@ def list_algorithms() -> list[str]:
 
 def algorithm_settings(name: str) -> type[AlgorithmSettings]:
     """The dataclass of an algorithm's keys; an UnknownNameError offers the nearest known name."""
-    return _ALGORITHMS[name].settings
+    return _ALGORITHMS[name][0]
 
 
 def make_algorithm(settings: AlgorithmSettings, policy: Any, stds: Any) -> Any:
     """The algorithm of these settings for a policy, whose steps have the standard deviations ``stds`` (S,)."""
-    code = _ALGORITHMS[settings.name].code
+    code = _ALGORITHMS[settings.name][1]
     if isinstance(code, str):
         module, _, attribute = code.partition(":")
         code = getattr(import_module(module), attribute)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -54,6 +54,8 @@ _PROBED_WITH_PROMPTS = 8
 """The same number in a run that uses the prompts of its real scenes."""
 _PICTURED = 6
 """Number of the guard's samples that are kept for the report."""
+_STATE = ("iteration", "invalid_streak", "rollbacks", "seconds", "history")
+"""Attributes of a trainer that are kept in a checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -102,33 +104,21 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     >>> len(result.history), result.history[0]["log_ratio"]
     (2, 0.0)
     """
-    _check_shares(config.batch_size, launched_processes())
-    processes = ProcessGroup.join(config.device)
-    with claimed(config.directory, "post_train") if processes.is_first else nullcontext():
-        trainer = PostTrainer(config, prior=prior)
-        try:
-            return trainer.run()
-        finally:
-            trainer.close()
-
-
-def _check_shares(batch_size: int, processes: int) -> None:
-    if batch_size % processes:
-        lower = batch_size // processes * processes
-        nearest = f"{lower} or {lower + processes}" if lower else str(processes)
+    if config.batch_size % (count := launched_processes()):
+        lower = config.batch_size // count * count
+        nearest = f"{lower} or {lower + count}" if lower else str(count)
         raise InvalidInputError(
-            f"batch_size={batch_size} is not a multiple of {processes}, the number of processes; give "
+            f"batch_size={config.batch_size} is not a multiple of {count}, the number of processes; give "
             f"batch_size={nearest}, or another number of processes"
         )
+    processes = ProcessGroup.join(config.device)
+    claim = claimed(config.directory, "post_train") if processes.is_first else nullcontext()
+    with claim, closing(PostTrainer(config, prior=prior)) as trainer:
+        return trainer.run()
 
 
 class PostTrainer:
-    """One run: its loop, its guard and its files.
-
-    Args:
-        config: configuration of the run.
-        prior: prior to start from, instead of the one that ``config.prior`` names.
-    """
+    """One run: its loop, its guard and its files; ``prior`` is that to start from, None the one of ``config.prior``."""
 
     guard: Guard
     scenes: SceneBank
@@ -149,12 +139,9 @@ class PostTrainer:
         self.learner = Learner(
             policy, config.resolved_reward(), config.algorithm, config.optimizer, config.regularisation,
             batch_size=config.batch_size, slots=config.slots, prompt=config.prompt, workers=config.workers,
-            physics=config.physics,
-            seed=config.seed,
+            physics=config.physics, seed=config.seed,
         )  # fmt: skip
-        self.iteration = 0
-        self.invalid_streak = 0
-        self.rollbacks = 0
+        self.iteration = self.invalid_streak = self.rollbacks = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
         self.logger = RunLogger(config.logger.name if self.processes.is_first else "csv", self.directory)
@@ -295,8 +282,14 @@ class PostTrainer:
         if row["valid_fraction"] > 0:
             self.invalid_streak = 0
             row |= self._learn(batch)
+        elif self.iteration == 0:
+            raise self._nothing_scored("no scene of the first batch")
         else:
-            self._count_invalid()
+            self.invalid_streak += 1
+            if self.invalid_streak >= MAX_INVALID:
+                raise self._nothing_scored(
+                    f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}"
+                )
         self.learner.learn_rewards(batch)
         self.iteration += 1
         return batch, row
@@ -339,15 +332,6 @@ class PostTrainer:
             self.rollbacks += 1
             self.learner.return_to(self._best())
             self.learner.regularisation.return_to_checkpoint(self.guard.best_ratio)
-
-    def _count_invalid(self) -> None:
-        self.invalid_streak += 1
-        if self.iteration == 0:
-            raise self._nothing_scored("no scene of the first batch")
-        if self.invalid_streak >= MAX_INVALID:
-            raise self._nothing_scored(
-                f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}"
-            )
 
     def _nothing_scored(self, what: str) -> TrainingError:
         return TrainingError(
@@ -404,11 +388,7 @@ class PostTrainer:
             return
         state = {
             "config": self.plain,
-            "iteration": self.iteration,
-            "invalid_streak": self.invalid_streak,
-            "rollbacks": self.rollbacks,
-            "seconds": self.seconds,
-            "history": self.history,
+            **{name: getattr(self, name) for name in _STATE},
             "guard": self.guard.state(),
             "learner": self.learner.state(),
         }
@@ -419,9 +399,8 @@ class PostTrainer:
             write_log(self.directory, self.history)
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self.iteration, self.invalid_streak = state["iteration"], state["invalid_streak"]
-        self.rollbacks = state["rollbacks"]
-        self.seconds, self.history = state["seconds"], list(state["history"])
+        for name in _STATE:
+            setattr(self, name, state[name])
         self.guard.restore(state["guard"])
         check_tensors(self.prior, state["learner"]["prior"], self.directory / CHECKPOINT_NAME)
         self.learner.restore(state["learner"])
