@@ -40,6 +40,7 @@ from agents.utils.loggers import make_logger
 from agents.utils.process_group import ProcessGroup, launched_processes
 from agents.utils.weight_average import AveragedWeights
 from rewards import reward_label
+from scene_envs.arrays import resolve_device
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed
 from scene_envs.scene import SceneBatch
@@ -103,7 +104,7 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     (2, 0.0)
     """
     _check_shares(config.batch_size, launched_processes())
-    processes = ProcessGroup.join(config.device)
+    processes = ProcessGroup.join(str(resolve_device(config.device, None if prior is None else prior.device)))
     with claimed(config.directory, "post_train") if processes.is_first else nullcontext():
         trainer = PostTrainer(config, prior=prior)
         try:
@@ -138,10 +139,12 @@ class PostTrainer:
         self.directory = config.directory
         self.processes = ProcessGroup.current()
         base = ScenePrior.load(config.prior if prior is None else prior)
+        self.device = resolve_device(config.device, None if prior is None else prior.device)
         if config.prompt is not None and not base.conditional:
             raise no_text(base.scene_type, str(config.prompt))
+        self._base: ScenePrior | None = base  # until the guard has measured it
         self.base_name = short_name(base.loaded_as) if base.loaded_as else ""
-        self.prior = deepcopy(base).to(config.device).eval()
+        self.prior = deepcopy(base).to(self.device).eval()
         policy = DenoisingPolicy(
             self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,
             claim_guidance=config.claim_guidance,
@@ -176,7 +179,8 @@ class PostTrainer:
         else:
             if self.processes.is_first:
                 write_text(self.directory / "config.yaml", sealed(config_text(self.plain)))
-            self.guard.start(self.prior)
+            if self.learner.learned:  # a reward that learns is another one later
+                self._start_guard()
             self._keep(self.prior)  # the best prior so far is the base
         title = f"post-train {self.prior.scene_type.name}"
         started = time.perf_counter() - self.seconds
@@ -221,7 +225,7 @@ class PostTrainer:
             if config.prompt == "data":
                 large = torch.nonzero(batch.counts > slots)[:, 0].tolist()
                 check_object_count([text for i in large for text in prompts(i)], self.prior.scene_type, slots)
-        x0 = self.prior.encode(batch.to(config.device))
+        x0 = self.prior.encode(batch.to(self.device))
         self.scenes = SceneBank.split(x0, config.guard.scenes, prompts)
         self.learner.deal_prompts(self.scenes)
         self.learner.begin_rewards(batch[: len(self.scenes.train)], first=not reuse_scenes)
@@ -281,7 +285,7 @@ class PostTrainer:
             scenes.heldout,
             config.guard.limit,
             stream_seed(config.seed, "guard"),
-            scenes.heldout_prompts(),
+            scenes.heldout_prompts,
             check,
             config.guard.sample_limits(config.algorithm.sample_limits),
             math.inf if target is None else target,
@@ -322,7 +326,14 @@ class PostTrainer:
             return self.rollbacks > _MAX_ROLLBACKS
         return self.config.guard.action == "stop" and self.guard.over_limit_at is not None
 
+    def _start_guard(self) -> None:
+        """Measure the base prior, with which later checks are compared; done before the first of them."""
+        if self._base is not None and not self.guard.started:
+            self.guard.start(deepcopy(self._base).to(self.device).eval())
+        self._base = None
+
     def _check(self, batch: TensorDict, *, sample: bool) -> None:
+        self._start_guard()
         since = self.guard.readings[-1].iteration if self.guard.readings else 0
         recent = [row["reward"] for row in self.history[since:] if math.isfinite(row["reward"])]
         reward = sum(recent) / len(recent) if recent else float("nan")

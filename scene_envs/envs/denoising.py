@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.envs.scoring import EnvPrompts, RewardScorer, Score
+from scene_envs.envs.scoring import EnvPrompts, RewardScorer, Score, prior_device
 from scene_envs.envs.settings import DenoisingSettings, takes
 from scene_envs.envs.spaces import (
     STATE_BOUND,
@@ -23,7 +23,6 @@ from scene_envs.envs.spaces import (
     check_slots,
     decode_scenes,
     occupied,
-    prior_device,
     prior_features,
     resolve_scene_and_prior,
 )
@@ -97,7 +96,7 @@ class DenoisingCore:
             raise InvalidInputError(f"num_envs={num_envs!r}: at least one environment is needed")
         chosen = DenoisingSettings(**settings)
         self.num_envs = num_envs
-        self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior)
+        self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior, chosen.device)
         self.slots = check_slots(self.scene_type, chosen.slots)
         self._features = prior_features(self.prior)
         self.action_mode = chosen.action_mode

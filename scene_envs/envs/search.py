@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from scene_envs.envs.masks import MaskGenerator, mask_for_prompt, masked_slots, resolve_mask
-from scene_envs.envs.scoring import EnvPrompts, RewardScorer, Score
+from scene_envs.envs.scoring import EnvPrompts, RewardScorer, Score, prior_device
 from scene_envs.envs.settings import SearchMaskSettings, SearchSettings, TreeSettings, check_physics_guidance, takes
-from scene_envs.envs.spaces import check_slots, prior_device, resolve_scene_and_prior
+from scene_envs.envs.spaces import check_slots, resolve_scene_and_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -131,7 +131,7 @@ class SearchProblem:
 
     def _begin(self, chosen: TreeSettings) -> None:
         """Resolve all settings but the mask."""
-        self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior)
+        self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior, chosen.device)
         self.slots = check_slots(self.scene_type, chosen.slots)
         self.device = prior_device(self.prior)
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
