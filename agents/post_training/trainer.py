@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -41,6 +41,7 @@ from agents.utils.process_group import ProcessGroup, launched_processes
 from agents.utils.weight_average import AveragedWeights
 from rewards import reward_label
 from scene_envs.arrays import resolve_device
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed
 from scene_envs.scene import SceneBatch
@@ -62,7 +63,7 @@ class PostTrainResult:
     """Result of a finished run.
 
     Attributes:
-        prior: best prior within the guard's limit, also in ``directory / "prior"``.
+        prior: best prior within the guard's limit, on the device of the run; also in ``directory / "prior"``.
         history: one row of the log per iteration.
         metrics: contents of ``metrics.json``.
         directory: folder of the run.
@@ -138,13 +139,13 @@ class PostTrainer:
         self.config, self.plain = config, config.plain()
         self.directory = config.directory
         self.processes = ProcessGroup.current()
-        base = ScenePrior.load(config.prior if prior is None else prior)
-        self.device = resolve_device(config.device, None if prior is None else prior.device)
+        base = cast(ScenePrior, resolve_prior(config.prior if prior is None else prior, config.device))
+        self.device = base.device
         if config.prompt is not None and not base.conditional:
             raise no_text(base.scene_type, str(config.prompt))
         self._base: ScenePrior | None = base  # until the guard has measured it
         self.base_name = short_name(base.loaded_as) if base.loaded_as else ""
-        self.prior = deepcopy(base).to(self.device).eval()
+        self.prior = deepcopy(base).eval()
         policy = DenoisingPolicy(
             self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,
             claim_guidance=config.claim_guidance,
@@ -329,7 +330,7 @@ class PostTrainer:
     def _start_guard(self) -> None:
         """Measure the base prior, with which later checks are compared; done before the first of them."""
         if self._base is not None and not self.guard.started:
-            self.guard.start(deepcopy(self._base).to(self.device).eval())
+            self.guard.start(deepcopy(self._base).eval())
         self._base = None
 
     def _check(self, batch: TensorDict, *, sample: bool) -> None:
@@ -462,4 +463,4 @@ class PostTrainer:
                 beyond=self.guard.over_limit_at,
                 highest=self.learner.largest_reward(),
             )
-        return PostTrainResult(self._best(), self.history, metrics, self.directory, self.config)
+        return PostTrainResult(self._best().to(self.device), self.history, metrics, self.directory, self.config)

@@ -39,7 +39,7 @@ from agents.priors.prior import (
 from scene_envs.datasets.prompts.facts import SIDES
 from scene_envs.datasets.prompts.parser import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.normalizer import Normalizer
+from scene_envs.normalizer import Normalizer, constant_on
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type, members_of
@@ -223,7 +223,7 @@ class MixedPrior(ScenePrior):
         """K = C + 1."""
         return self.config.network.categories
 
-    @property
+    @cached_property
     def is_constant(self) -> Tensor:
         """(D,) bool: features of the pose that never vary."""
         constant = self.normalizer.is_constant.clone()
@@ -310,7 +310,7 @@ class MixedPrior(ScenePrior):
 
     def _fitting_assets(self, present: Tensor) -> Tensor:
         """(B, C) bool: assets of the members that have all of ``present`` (B, C) bool; all if no member has them."""
-        members = self._members.to(present.device)
+        members = constant_on(self._members, present.device)
         fits = ~(present[:, None] & ~members).any(dim=-1)  # (B, M)
         allowed = (fits[..., None] & members).any(dim=1)
         return allowed | ~fits.any(dim=-1, keepdim=True)

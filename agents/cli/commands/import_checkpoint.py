@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from agents.cli.commands.scenes import check_files
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DeviceKeys, named
+from scene_envs.arrays import resolve_device
 from scene_envs.errors import InvalidInputError
 
 POSITIONAL = ("checkpoint", "metadata")
