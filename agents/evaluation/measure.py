@@ -145,7 +145,7 @@ def evaluate(
     sampler = cast(Sampler, resolve_prior(prior, device))
     if reference is None:
         reference = grammar_scenes(sampler.scene_type, count, seed=seed)
-    samples = sampler.sample(count, num_steps=num_steps, seed=seed, batch_size=batch_size)
+    samples = sampler.sample(count, num_steps=num_steps, seed=seed, batch_size=batch_size).to("cpu")
     figures = measure_samples(samples, reference, floor=floor, pool=pool, ready=ready)
     return {"num_steps": float(num_steps), **figures}
 

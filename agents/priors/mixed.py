@@ -287,7 +287,7 @@ class MixedPrior(ScenePrior):
         already. If the chain only absorbs, the category that a slot holds already is not barred in this slot.
         """
         barred = torch.zeros(*state.shape, self.num_categories, dtype=torch.bool, device=state.device)
-        barred[:, len(self.scene_type.fixed) :, list(self.scene_type.fixed_categories)] = True
+        barred[:, len(self.scene_type.fixed) :] = constant_on(self._fixed_kinds, state.device)
         if closed is not None:
             barred |= closed[:, None]
         if self.categories.only_absorbs:
@@ -301,6 +301,11 @@ class MixedPrior(ScenePrior):
     def _separates_members(self) -> bool:
         """Whether a scene holds the assets of one member of a union only."""
         return self.config.union == "one_type" and len(self._members) > 1 and self.categories.only_absorbs
+
+    @cached_property
+    def _fixed_kinds(self) -> Tensor:
+        """(K,) bool: categories of fixed objects."""
+        return torch.isin(torch.arange(self.num_categories), torch.tensor(self.scene_type.fixed_categories))
 
     @cached_property
     def _members(self) -> Tensor:

@@ -261,7 +261,7 @@ class DenoisingTorchRLEnv(EnvBase):
         return observed
 
     def _observe(self, result: StepResult | None) -> TensorDict:
-        finished = torch.from_numpy(self.core.finished).unsqueeze(-1).to(self.core.device)
+        finished = self.core.column(self.core.finished)
         valid = torch.ones_like(finished) if result is None else result.valid.unsqueeze(-1)
         fields = {
             **self.core.observation(),

@@ -137,7 +137,8 @@ class RegionMask:
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         """(N,) bool, True where a slot is regenerated."""
         place = scene.translations[0]
-        inside = ((place >= torch.tensor(self.low)) & (place <= torch.tensor(self.high))).all(dim=-1)
+        low, high = (torch.tensor(corner, device=place.device) for corner in (self.low, self.high))
+        inside = ((place >= low) & (place <= high)).all(dim=-1)
         return (inside & scene.is_free[0]) | _some(scene.is_empty[0], self.empty, rng)
 
 

@@ -85,10 +85,6 @@ class Score:
     per_object: Tensor | None = None
     object_flags: Mapping[str, Tensor] = field(default_factory=dict)
 
-    def to(self, device: torch.device) -> Score:
-        """The same verdict on another torch device."""
-        return self._each(lambda values: values.to(device))
-
     def row(self, index: int) -> Score:
         """The verdict on one scene, as a batch of one."""
         return self._each(lambda values: values[index : index + 1])
@@ -104,7 +100,7 @@ class Score:
 
 
 class RewardScorer:
-    """Scorer of batches of scenes on the CPU; its reward, a name, mapping, function or object, is resolved once. The
+    """Scorer of batches of scenes, on their device; its reward (name, mapping, function or object) is resolved once. The
     ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
     ``physics`` names the engine.
 

@@ -273,8 +273,8 @@ class SearchProblem:
 
     def _values(self, batch: SceneBatch) -> Tensor:
         """(B,) Φ of scenes; 0 where the objective cannot score one."""
-        score = self.scorer(batch.to("cpu"), None if self.prompt is None else [self.prompt] * len(batch))
-        return torch.where(score.valid, score.value / self.scale, torch.zeros(())).clamp(0.0, 1.0)
+        score = self.scorer(batch, None if self.prompt is None else [self.prompt] * len(batch))
+        return torch.where(score.valid, score.value / self.scale, torch.zeros(())).clamp(0.0, 1.0).cpu()
 
     def _score(self, batch: SceneBatch, origins: Sequence[tuple[int, tuple[int, ...], float]]) -> list[SearchState]:
         """States of ``batch``, given each one's (seed, path, value of the parent)."""

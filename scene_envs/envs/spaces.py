@@ -67,10 +67,10 @@ def prior_features(prior: PriorLike) -> int:
 
 
 def decode_scenes(prior: PriorLike, x: Tensor) -> SceneBatch:
-    """The scenes of x (B, N, D) on the CPU: rotations in SO(3), arg-max categories."""
+    """The scenes of x (B, N, D), on its device: rotations in SO(3), arg-max categories."""
     if isinstance(prior, EncodedPriorLike) and prior.features != prior.scene_type.features:
-        return prior.decode(x.cpu())
-    return SceneBatch.from_tensor(x.cpu(), prior.scene_type, normalised=prior.normalizer)
+        return prior.decode(x)
+    return SceneBatch.from_tensor(x, prior.scene_type, normalised=prior.normalizer)
 
 
 def occupied(x: Tensor, scene_type: SceneType) -> Tensor:
@@ -128,7 +128,7 @@ def picture(batch: SceneBatch, highlight: Tensor | None = None) -> np.ndarray:
     """(B, H, W, 3) uint8 pictures, with the objects of ``highlight`` (B, N) bool in red (loads the renderer)."""
     from scene_envs.render import render
 
-    return render(batch, style="picture", highlight=highlight)
+    return render(batch.to("cpu"), style="picture", highlight=highlight)
 
 
 class ResetNeededError(SceneEnvsError, gymnasium.error.ResetNeeded):
