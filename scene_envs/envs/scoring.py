@@ -100,8 +100,8 @@ class Score:
 
 
 class RewardScorer:
-    """Scorer of batches of scenes, on their device; its reward (name, mapping, function or object) is resolved once. The
-    ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
+    """Scorer of batches of scenes, on their device; its reward, a name, mapping, function or object, is resolved once.
+    The ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
     ``physics`` names the engine.
 
     >>> scorer = RewardScorer("object_count")

@@ -47,6 +47,11 @@ class Crossings(TorchFunctionMode):
         self.to_gpu: Counter[str] = Counter()
         self.reads: Counter[str] = Counter()
 
+    def clear(self) -> None:
+        """Forget what was counted."""
+        for counts in (self.to_host, self.to_gpu, self.reads):
+            counts.clear()
+
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return _call(func, args, kwargs or {}, self)
 
