@@ -1,8 +1,9 @@
-"""Types of numpy arrays, ranges of their rows, and devices by name. The module does not import torch."""
+"""Types of numpy arrays, ranges of their rows, devices by name, and work in their memory; torch is not imported."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Result = TypeVar("Result")
 
 
 def ranges(first: Index, counts: Index) -> tuple[Index, Index]:
@@ -58,3 +60,31 @@ def resolve_device(name: str | torch.device, auto: torch.device | None = None) -
         found = "" if count else "; torch finds no CUDA GPU"
         raise InvalidInputError(f"device={str(name)[:60]!r} is no device of this machine; use one of {here}{found}")
     return device
+
+
+def within_memory(work: Callable[[int], Result], size: int, key: str) -> Result:
+    """``work(size)``, where ``size`` scenes are computed at once, as ``key`` says.
+
+    Raises:
+        InvalidInputError: the memory is too small; the message gives the largest half, quarter, ... of ``size`` with
+            which ``work`` ends.
+    """
+    done, reason = _attempt(work, size)
+    if done:
+        return done[0]
+    fits = size // 2
+    while fits and not _attempt(work, fits)[0]:
+        fits //= 2
+    advice = f"{key}={fits} fits" if fits else "not even one fits"
+    raise InvalidInputError(f"{key}={size} needs more memory than the device has ({reason}); {advice}")
+
+
+def _attempt(work: Callable[[int], Result], size: int) -> tuple[list[Result], str]:
+    """The result, or none and the reason; the tensors of a failed attempt are freed."""
+    try:
+        return [work(size)], ""
+    except (MemoryError, RuntimeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        if not (isinstance(error, MemoryError) or "out of memory" in reason or "can't allocate memory" in reason):
+            raise
+    return [], reason

@@ -7,6 +7,7 @@ import time
 from contextlib import nullcontext
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -295,7 +296,7 @@ class PostTrainer:
 
     def step(self) -> tuple[TensorDict, dict[str, float]]:
         """One iteration: a batch of fresh scenes and its updates. Returns the batch and the row for the log."""
-        batch = self.learner.rollout(self.iteration)
+        batch = self.learner.in_memory(lambda: self.learner.rollout(self.iteration))
         row = {"iteration": float(self.iteration + 1), **reward_figures(batch)}
         if row["valid_fraction"] > 0:
             self.invalid_streak = 0
@@ -313,7 +314,7 @@ class PostTrainer:
         for update in range(updates):
             index = self.iteration * updates + update
             try:
-                row = self.learner.update(batch, self.scenes, index)
+                row = self.learner.in_memory(partial(self.learner.update, batch, self.scenes, index))
             except NonFiniteGradient as error:
                 raise self._not_finite(error.figures) from None
         self.learner.algorithm.end_iteration()

@@ -29,7 +29,7 @@ from agents.utils.interrupts import Ending, finishing_steps
 from agents.utils.loggers import RunLogger, make_logger
 from agents.utils.process_group import ProcessGroup, is_first_process
 from agents.utils.weight_average import AveragedWeights, WeightAverage
-from scene_envs.arrays import resolve_device
+from scene_envs.arrays import resolve_device, within_memory
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed, write_json, write_text
 from scene_envs.progress import Progress
@@ -231,9 +231,13 @@ class Pretrainer:
             generator = derived_generator(
                 config.seed, self.step, self.processes.rank * config.optimizer.compute.accumulate + part
             )
-            loss = self._part_loss(config.batch_size // self.parts, generator) / self.parts
-            loss.backward()  # type: ignore[no-untyped-call]
-            total += loss.detach()
+
+            def part_loss(count: int, generator: Generator = generator) -> Tensor:
+                loss = self._part_loss(count, generator) / self.parts
+                loss.backward()  # type: ignore[no-untyped-call]
+                return loss.detach()
+
+            total += within_memory(part_loss, config.batch_size // self.parts, "batch_size / number of parts")
         value = float(self.processes.sum(total))
         if not math.isfinite(value):
             raise self._not_finite("loss", value)
