@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
@@ -69,22 +70,17 @@ def within_memory(work: Callable[[int], Result], size: int, key: str) -> Result:
         InvalidInputError: the memory is too small; the message gives the largest half, quarter, ... of ``size`` with
             which ``work`` ends.
     """
-    done, reason = _attempt(work, size)
-    if done:
-        return done[0]
-    fits = size // 2
-    while fits and not _attempt(work, fits)[0]:
-        fits //= 2
+    reason, fits = "", size
+    while fits:
+        try:
+            found = work(fits)
+            break
+        except (MemoryError, RuntimeError) as error:
+            reason = reason or (str(error).splitlines() or [type(error).__name__])[0][:200]
+            if not (isinstance(error, MemoryError) or re.search("out of memory|can't allocate memory", str(error))):
+                raise
+        fits //= 2  # out of the clause above, which holds the tensors of the attempt
+    if fits == size:
+        return found
     advice = f"{key}={fits} fits" if fits else "not even one fits"
     raise InvalidInputError(f"{key}={size} needs more memory than the device has ({reason}); {advice}")
-
-
-def _attempt(work: Callable[[int], Result], size: int) -> tuple[list[Result], str]:
-    """The result, or none and the reason; the tensors of a failed attempt are freed."""
-    try:
-        return [work(size)], ""
-    except (MemoryError, RuntimeError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        if not (isinstance(error, MemoryError) or "out of memory" in reason or "can't allocate memory" in reason):
-            raise
-    return [], reason

@@ -77,11 +77,6 @@ class Guard:
         self.best_reward = self.best_score = float("-inf")
         self.best_iteration = 0
 
-    @property
-    def started(self) -> bool:
-        """Whether the base prior has been measured."""
-        return not math.isnan(self.base_loss)
-
     def start(self, base: ScenePrior) -> None:
         """Measure the base prior."""
         self.base_loss, self.base_figures = self._measure(base, sample=True)

@@ -330,7 +330,7 @@ class PostTrainer:
 
     def _start_guard(self) -> None:
         """Measure the base prior, with which later checks are compared; done before the first of them."""
-        if self._base is not None and not self.guard.started:
+        if self._base is not None and math.isnan(self.guard.base_loss):
             self.guard.start(deepcopy(self._base).eval())
         self._base = None
 
