@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.normalizer import constant_on
 
 UNMASKINGS = ("systematic", "even", "independent")
 """Ways to choose the masked slots that a step unmasks."""
@@ -124,9 +125,11 @@ class CategoricalProcess:
         """Whether a category is either unchanged or masked, so that a visible category is the clean one."""
         return not bool(_replaced(self.schedule.keep, self.schedule.mask).any())
 
-    def rates(self, start: Tensor | int, end: Tensor | int) -> tuple[Tensor, Tensor]:
+    def rates(
+        self, start: Tensor | int, end: Tensor | int, device: torch.device | None = None
+    ) -> tuple[Tensor, Tensor]:
         """keep and mask probability of the stride ``start`` -> ``end`` (start < end), float64."""
-        keep, mask = self.schedule.keep, self.schedule.mask
+        keep, mask = (constant_on(rate, device or rate.device) for rate in (self.schedule.keep, self.schedule.mask))
         kept = keep[end] / keep[start].clamp(min=_TINY)
         masked = 1.0 - (1.0 - mask[end]) / (1.0 - mask[start]).clamp(min=_TINY)
         masked = masked.clamp(0.0, 1.0)
@@ -177,9 +180,7 @@ class CategoricalProcess:
         t, previous = torch.as_tensor(t), torch.as_tensor(previous)
         keep_s, mask_s = self._rates_at(previous, x_t)
         keep_t, mask_t = self._rates_at(t, x_t)
-        keep_ts, mask_ts = (
-            fitted(rate.to(x_t.device), x_t).unsqueeze(-1) for rate in self.rates(previous.cpu(), t.cpu())
-        )
+        keep_ts, mask_ts = (fitted(rate, x_t).unsqueeze(-1) for rate in self.rates(previous, t, x_t.device))
         k, masked = self.categories, (x_t == self.categories).unsqueeze(-1)
         here = F.one_hot(x_t.clamp(max=k - 1), k).double()
         likelihood = torch.where(masked, mask_t, keep_t * here + _replaced(keep_t, mask_t) / k)  # q(x_t | x_0)
@@ -193,7 +194,7 @@ class CategoricalProcess:
 
     def _rates_at(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Cumulative keep and mask at ``t``, shaped (B, ..., 1) for states ``like`` (B, ...)."""
-        keep, mask = (rate[t.cpu()].to(like.device) for rate in (self.schedule.keep, self.schedule.mask))
+        keep, mask = (constant_on(rate, like.device)[t] for rate in (self.schedule.keep, self.schedule.mask))
         return fitted(keep, like).unsqueeze(-1), fitted(mask, like).unsqueeze(-1)
 
     def log_prob(self, x_s: Tensor, probs: Tensor) -> Tensor:

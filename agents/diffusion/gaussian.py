@@ -13,6 +13,7 @@ from torch import Tensor
 
 from agents.diffusion.categorical import CategoricalProcess, fitted
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.normalizer import constant_on
 
 PREDICTIONS = ("edm", "epsilon", "x0", "v")
 """Targets that a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
@@ -249,10 +250,11 @@ class GaussianProcess:
         self.preconditioning = preconditioning
         self.alpha = schedule.alpha_bar.sqrt().float()  # (T + 1,)
         self.sigma = (1.0 - schedule.alpha_bar).sqrt().float()  # (T + 1,)
+        self._stds: dict[tuple[Any, ...], Tensor] = {}
 
     def rates(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """alpha_t and sigma_t, shaped to broadcast against ``like`` (B, N, D)."""
-        alpha, sigma = self.alpha.to(like.device)[t], self.sigma.to(like.device)[t]
+        alpha, sigma = constant_on(self.alpha, like.device)[t], constant_on(self.sigma, like.device)[t]
         return fitted(alpha, like), fitted(sigma, like)
 
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
@@ -352,7 +354,10 @@ class GaussianProcess:
         x0_weight = float(a_s.sqrt() - a_t.sqrt() * xt_weight)
         if residual is not None and previous > 0:
             variance = variance + (eta * x0_weight) ** 2 * residual.double().cpu()
-        return x0_weight * x0 + xt_weight * x_t, variance.sqrt().float().to(x_t.device)
+        key = (t, previous, eta, tuple(variance.reshape(-1).tolist()))
+        if key not in self._stds:  # one tensor for each step, of which a device then has one copy
+            self._stds[key] = variance.sqrt().float()
+        return x0_weight * x0 + xt_weight * x_t, constant_on(self._stds[key], x_t.device)
 
     def estimate(self, t: int, previous: int, residual: ResidualVariance | None = None) -> tuple[float, Tensor]:
         """Weight of the denoised scene in the mean of x_s, s < t, and standard deviation (D,) of its error.
@@ -372,7 +377,8 @@ class GaussianProcess:
     def _moments(self, like: Tensor, moments: Moments | None) -> Moments:
         if moments is not None:
             return moments
-        return self.preconditioning.mean.to(like), self.preconditioning.std.to(like)
+        mean, std = (constant_on(x, like.device) for x in (self.preconditioning.mean, self.preconditioning.std))
+        return mean.to(like.dtype), std.to(like.dtype)
 
 
 def timestep_weights(distribution: str, schedule: NoiseSchedule, mean: float, std: float) -> Tensor:

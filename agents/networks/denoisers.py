@@ -39,8 +39,8 @@ class Denoiser(nn.Module):
     def output(self, x_t: Tensor, t: Tensor) -> Tensor:
         """The raw network output (B, N, D), in the units of ``process.target``."""
         process = self.process
-        alpha, _ = process.rates(t, x_t)
-        level = (process.sigma[t.cpu()] / process.alpha[t.cpu()]).to(x_t.device)
+        alpha, sigma = process.rates(t, x_t)
+        level = (sigma / alpha).reshape(t.shape)
         with autocast(x_t, self.precision):
             result: Tensor = self.network(process.network_input(x_t, t), x_t / alpha, level)
         return result.to(x_t.dtype)
@@ -152,8 +152,8 @@ class MixedDenoiser(nn.Module):
             text: (B, L, W) tokens and (B, L) their mask.
         """
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
-        alpha, _ = self.poses.rates(t, pose)
-        ratio = (self.poses.sigma[t.cpu()] / self.poses.alpha[t.cpu()]).to(x_t.device)
+        alpha, sigma = self.poses.rates(t, pose)
+        ratio = (sigma / alpha).reshape(t.shape)
         level = ratio[:, None].expand(pose.shape[:2])
         scaled = self.poses.network_input(pose, t)
         position = pose / alpha

@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from agents.post_training.report import (
     PHYSICS_TIMEOUT,
@@ -29,6 +29,7 @@ from agents.post_training.report import (
 from agents.post_training.run_files import METRICS_NAME, write_metrics
 from agents.priors.prior import ScenePrior
 from rewards import reward_label
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import TrainingError
 from scene_envs.files import read_sealed
 from scene_envs.workers import Task, WorkerPool
@@ -42,7 +43,7 @@ def run_demo(
     seed: int = 0,
     workers: int = 2,
     *,
-    device: str = "cpu",
+    device: str = "auto",
     progress: str = "bar",
     scenes: int = 24,
     num_steps: int = 50,
@@ -58,6 +59,7 @@ def run_demo(
 
     directory, started = Path(output), time.perf_counter()
     keys = [f"seed={seed}", f"workers={-(-workers // len(runs))}", "logger.report_scenes=0"]
+<<<<<<< HEAD
     keys += [f"device={device}", f"progress={progress}", "logger.checkpoint_every=1"]  # an interrupt ends runs at once
     tasks = [
         Task((name, [*words, *keys, f"output={directory / name}"]), f"the run {name!r}") for name, words in runs.items()
@@ -85,6 +87,26 @@ def run_demo(
         processes.map(tasks, done=measure)
     results = {name: _Finished(directory / name) for name in runs}
     measured = {label: found[label] for label in ("base", *runs)}
+=======
+    keys += [f"device={device}", f"progress={progress}"]
+    commands = {name: [*words, *keys, f"output={directory / name}"] for name, words in runs.items()}
+    base: ScenePrior | None = None
+    results: dict[str, _Finished] = {}
+    measured: dict[str, Measured] = {}
+    with make_pool(workers, PHYSICS_TIMEOUT) as pool, _post_training(commands) as processes:
+        for name, process in processes.items():
+            if status := process.wait():
+                raise TrainingError(f"the run {name!r} ended with status {status}; its message stands above")
+            results[name] = run = _Finished(directory / name)
+            base = cast(ScenePrior, resolve_prior(run.config["prior"], device)) if base is None else base
+            for label, tested in {"base": base, name: ScenePrior.load(directory / name).to(base.device)}.items():
+                if label not in measured:  # the other run goes on while samples are measured
+                    print(f"measuring {scenes} samples of the prior {label!r}", file=sys.stderr, flush=True)
+                    measured[label] = measure_prior(
+                        tested, scenes, num_steps=num_steps, seed=seed + SAMPLE_SEED, pool=pool
+                    )
+    assert base is not None
+>>>>>>> h-device
     metrics = {
         **{name: part.figures for name, part in measured.items()},
         "runs": {name: run.metrics for name, run in results.items()},

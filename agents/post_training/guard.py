@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -40,7 +40,7 @@ class Guard:
         heldout: (K, N, D) normalised real scenes that are not used by the regularisation.
         limit: largest ratio before the run counts as over-optimised; no checkpoint above it is kept.
         seed: seed of the fixed timesteps and noise.
-        prompts: one prompt of each held-out scene; None measures without prompts.
+        prompts: gives one prompt of each held-out scene; the loss is measured without prompts where it gives None.
         samples: settings for sampling and measuring; None measures the loss alone.
         limits: largest excess of each figure of samples over that of the base prior, by name.
         target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
@@ -59,7 +59,7 @@ class Guard:
         heldout: Tensor,
         limit: float,
         seed: int,
-        prompts: Sequence[str] | None = None,
+        prompts: Callable[[], Sequence[str] | None] = lambda: None,
         samples: SampleCheck | None = None,
         limits: Mapping[str, float] | None = None,
         target: float = math.inf,
@@ -99,12 +99,27 @@ class Guard:
     @torch.no_grad()
     def loss(self, prior: ScenePrior) -> float:
         """Pretraining loss on the held-out scenes; the same timesteps and noise at every call."""
+<<<<<<< HEAD
         generator, losses = Generator().manual_seed(self.seed), []
         for start in range(0, len(self.heldout), _CHUNK):
             rows = slice(start, start + _CHUNK)
             text = None if self.prompts is None else prior.encode_prompts(self.prompts[rows])
             losses.append(prior.pretraining_loss(self.heldout[rows].to(prior.device), generator, "none", text=text))
         return float(torch.cat(losses).mean())
+=======
+        from agents.pretraining.trainer import heldout_loss
+
+        device = next(prior.parameters()).device
+        if (prompts := self.prompts()) is not None:
+            generator = Generator().manual_seed(self.seed)
+            chunks = [prompts[start : start + _CHUNK] for start in range(0, len(self.heldout), _CHUNK)]
+            losses = [
+                prior.pretraining_loss(x0.to(device), generator, "none", text=prior.encode_prompts(chunk))
+                for x0, chunk in zip(self.heldout.split(_CHUNK), chunks, strict=True)
+            ]
+            return float(torch.cat(losses).mean())
+        return heldout_loss(prior, self.heldout.to(device), seed=self.seed)
+>>>>>>> h-device
 
     def check(
         self,

@@ -6,6 +6,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -22,10 +23,11 @@ from agents.networks.text import Text
 from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.files import StoredPrior, explained, read_stored, write_stored
 from agents.priors.guidance import Guide, Hook, Watch, guidance_hook, physics_strength
+from scene_envs.arrays import within_memory
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.envs.settings import check_claim_guidance, check_guidance, check_physics_guidance
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.normalizer import Normalizer
+from scene_envs.normalizer import Normalizer, constant_on
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
@@ -272,21 +274,21 @@ class ScenePrior(nn.Module, ABC):
         """Leading features of the continuous output that are poses; the others, if any, are categories."""
         return POSE_FEATURES
 
-    @property
+    @cached_property
     def is_constant(self) -> Tensor:
         """(D,) bool: features that never vary."""
         return self.normalizer.is_constant
 
     def known(self, slots: int) -> Tensor:
         """(slots, D) bool: entries that are clamped (fixed welded slots, constant features)."""
-        known = self.is_constant.to(self._fixed.device).expand(slots, -1).clone()
+        known = constant_on(self.is_constant, self._fixed.device).expand(slots, -1).clone()
         known[: len(self.scene_type.fixed)] = True
         return known
 
     def clamp(self, x: Tensor) -> Tensor:
         """``x`` (B, N, D) with its known entries set to their values."""
         count = len(self.scene_type.fixed)
-        x = torch.where(self.is_constant.to(x.device), torch.zeros_like(x), x)
+        x = torch.where(constant_on(self.is_constant, x.device), torch.zeros_like(x), x)
         if count:
             x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
         return x
@@ -410,16 +412,20 @@ class ScenePrior(nn.Module, ABC):
         prompts = self._check_prompts(prompt, guidance, claim_guidance, count, wide)
         strength = physics_strength(physics_guidance, self.config, self.scene_type)
         generator, table = Generator(str(self.device)).manual_seed(seed), self.step_table(num_steps)
-        chunks = []
-        for start in range(0, count, batch_size):
-            texts = None if prompts is None else prompts[start : start + batch_size]
-            size = min(batch_size, count - start)
+
+        def denoised(start: int, size: int) -> Tensor:
+            texts = None if prompts is None else prompts[start : start + size]
             hook = self.sampling_hook(
                 size, wide, num_steps, prompts=texts, claim_guidance=claim_guidance, physics_guidance=strength
             )
             text = None if texts is None else self.encode_prompts(texts)
             x = self.initial(size, wide, generator)
-            chunks.append(self.run_chain(x, table, generator, text=text, guidance=guidance, eta=eta, hook=hook))
+            return self.run_chain(x, table, generator, text=text, guidance=guidance, eta=eta, hook=hook)
+
+        chunks = [
+            within_memory(partial(denoised, start), min(batch_size, count - start), "batch_size")
+            for start in range(0, count, batch_size)
+        ]
         return self.decode(torch.cat(chunks))
 
     @abstractmethod

@@ -58,7 +58,7 @@ def blamed_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Generat
 
 def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
     """A random half of the free objects (rounded up), and all empty slots."""
-    free = torch.nonzero(scene.is_free[0]).flatten().numpy()
+    free = torch.nonzero(scene.is_free[0]).flatten().cpu().numpy()
     chosen = rng.choice(free, size=(len(free) + 1) // 2, replace=False)
     mask = scene.is_empty[0].clone()
     mask[torch.from_numpy(chosen)] = True
@@ -86,6 +86,70 @@ class EmptyMask:
 
 
 @dataclass(frozen=True)
+<<<<<<< HEAD
+=======
+class LowestScoringMask:
+    """The ``count`` free objects of the lowest credit, ties at random; InvalidInputError without credits per object."""
+
+    count: int = 4
+
+    def __post_init__(self) -> None:
+        check_count("lowest_scoring", "count", self.count)
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        if score.per_object is None:
+            raise InvalidInputError(
+                "mask=lowest_scoring needs an objective with credit per object; choose another mask"
+            )
+        credit = score.per_object[0].double().masked_fill(~scene.is_free[0], torch.inf).cpu().numpy()
+        order = np.lexsort((rng.random(len(credit)), credit))[: self.count]
+        mask = torch.zeros_like(scene.is_empty[0])
+        mask[torch.from_numpy(order)] = True
+        return mask & scene.is_free[0]
+
+
+@dataclass(frozen=True)
+class RegionMask:
+    """The free objects whose frames are in a box of the workspace, from ``low`` to ``high`` (x, y, z, m), and ``empty``
+    random empty slots.
+    """
+
+    low: Sequence[float] = (-np.inf, -np.inf, -np.inf)
+    high: Sequence[float] = (np.inf, np.inf, np.inf)
+    empty: int = 4
+
+    def __post_init__(self) -> None:
+        if len(self.low) != 3 or len(self.high) != 3 or any(a > b for a, b in zip(self.low, self.high, strict=True)):
+            raise InvalidInputError(f"mask=region: low={self.low} and high={self.high} are no corners x, y, z of a box")
+        check_count("region", "empty", self.empty)
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        place = scene.translations[0]
+        low, high = (torch.tensor(corner, device=place.device) for corner in (self.low, self.high))
+        inside = ((place >= low) & (place <= high)).all(dim=-1)
+        return (inside & scene.is_free[0]) | _some(scene.is_empty[0], self.empty, rng)
+
+
+@dataclass(frozen=True)
+class ExplicitMask:
+    """Slots that the user lists by their indices."""
+
+    slots: Sequence[int] = ()
+
+    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
+        """(N,) bool, True where a slot is regenerated."""
+        mask = torch.zeros_like(scene.is_empty[0])
+        outside = [slot for slot in self.slots if not 0 <= slot < len(mask)]
+        if outside or not self.slots:
+            raise InvalidInputError(f"mask=explicit: slots={list(self.slots)} must be some of 0..{len(mask) - 1}")
+        mask[list(self.slots)] = True
+        return mask
+
+
+@dataclass(frozen=True)
+>>>>>>> h-device
 class OffPromptMask:
     """The objects beyond the numbers in the prompt, both objects of a relation that does not hold, and one empty slot
     for each missing object. Without a ``prompt`` of its own, the mask takes the prompt of the search.

@@ -312,7 +312,7 @@ class ForwardProcess(AveragedSampler):
 
         With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
         """
-        x0 = self.prior.encode(finished_scenes(batch).to(self.prior.device))
+        x0 = self.prior.encode(finished_scenes(batch))
         scenes = batch.exclude("next", "timestep")[:, -1].set("scene", x0)
         processes = ProcessGroup.current()
         valid = max(1.0, processes.sum_numbers(int(scenes["valid"].sum()))[0])
