@@ -119,21 +119,11 @@ def evaluate(
         num_steps: denoiser evaluations per sample.
         seed: seed of the samples, and of the grammar if it is used.
         batch_size: number of scenes denoised at once.
-<<<<<<< HEAD
         floor, pool, ready: as for :func:`measure_samples`.
-    """
-    sampler: Any = resolve_prior(prior)
-=======
-        pool: worker processes for physics; None computes in this process.
-        ready: whether to also project and settle the samples.
         device: torch device of the network; ``"auto"`` is that of a prior that is given, and for a name the GPU where
             torch finds one, else the CPU.
-
-    Returns:
-        The figures of :func:`measure_samples`, and ``num_steps``.
     """
-    sampler = cast(Sampler, resolve_prior(prior, device))
->>>>>>> h-device
+    sampler: Any = resolve_prior(prior, device)
     if reference is None:
         reference = grammar_scenes(sampler.scene_type, count, seed=seed)
     samples = sampler.sample(count, num_steps=num_steps, seed=seed, batch_size=batch_size).to("cpu")

@@ -116,98 +116,7 @@ def run_search(
         return _Run(prior, objective, config, named, scenes, folder, progress).search()
 
 
-<<<<<<< HEAD
 @dataclass
-=======
-def _search(
-    prior: Any,
-    objective: Any,
-    starts: SceneBatch | None,
-    named: dict[str, Any],
-    config: SearchConfig,
-    folder: Path | None,
-    progress: Progress | None,
-) -> SearchOutcome:
-    """:func:`run_search` with its settings resolved, in a folder that no other process writes into."""
-    loaded = resolve_prior(prior, config.device)
-    fixed = {key: value for key, value in named.items() if key not in _LIMITS} | {"prior": loaded}
-    if starts is not None:
-        if starts.scene_type.name != loaded.scene_type.name:
-            raise InvalidInputError(
-                f"the prior makes scenes of {loaded.scene_type.name!r}, and the search would start from scenes of "
-                f"{starts.scene_type.name!r}; give a prior of that type"
-            )
-        fixed["scenes"], least = starts, max(loaded.scene_type.slots, starts.tensor.shape[1])
-        starts = starts.with_slots(least if config.slots is None else config.slots)
-    run = _Run(loaded, objective, config, fixed, folder, starts)
-    started = time.perf_counter()
-    planner, scenes = config.planner.make(config.branching), config.expansions
-    actions = max(scenes, config.branching) if config.planner.widens else config.branching
-    searches: list[PlanResult] = []
-    firsts: dict[int, SearchState] = {}
-    spent, stopped, parts = 0, "", config.parts
-    for part in parts:
-        left = math.inf if config.max_seconds is None else config.max_seconds - (time.perf_counter() - started)
-        if left <= 0 and spent:
-            stopped = "time"
-            break
-        name = "search" if len(parts) == 1 else f"search_{part.start:06}"
-        env, session, plans = run.plan(planner, actions, scenes, part, name, progress, max(left, 1e-9))
-        spent, stopped = spent + sum(len(plan.values) for plan in plans), session.stopped
-        found = plans if starts is not None else [plan for plan in plans if plan.best_path]
-        searches += found
-        if starts is None:
-            searches.sort(key=loss_of)
-        for lane in session.lanes:
-            if starts is not None or lane.first:
-                new = lane.first[: config.branching] if starts is None else [lane.root]
-                firsts[lane.root.seed] = max(new, key=lambda state: state.value if state.valid else -1.0)
-        if folder is not None and len(parts) > 1 and searches:
-            _scenes(env, searches).save(folder / "best.safetensors")
-        if stopped:
-            break
-    searched, best_of = time.perf_counter(), None
-    if config.baseline and spent and stopped in ("", "time"):
-        # Children are seeded by their path: the first scenes are those of the first search, unless that is steered.
-        wide = spent if config.masks is None else max(actions, -(-spent // len(config.masks)))
-        _, _, (best_of,) = run.plan(BestOfPlanner(), wide, spent, range(1), "best of N", progress)
-    seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}
-    root = session.lanes[0].root
-    if not searches and root.value >= 1:
-        raise InvalidInputError(
-            f"the objective {objective!r} is {root.objective:.4g} for the empty scene already, and the search ends at "
-            f"objective_scale={env.problem.scale:.4g}; give a larger objective_scale"
-        )
-    if not any(math.isfinite(plan.best_value) for plan in searches):
-        which = f"the first {config.branching} samples of the prior" if starts is None else "the scenes of the search"
-        raise SceneEnvsError(
-            f"the search was interrupted before its first {config.branching} scenes were made; call it again"
-            if stopped and not spent
-            else f"the objective {objective!r} could not score any of {which}; the log above says why"
-        )
-    best = min(searches, key=loss_of)
-    first = firsts[best.best_state.seed]
-    outcome = SearchOutcome(
-        search=best,
-        searches=searches,
-        best_of=best_of,
-        first=env.scene(first),
-        best=_scenes(env, searches),
-        metrics=search_metrics(
-            objective, env.problem.scale, config, searches, best_of, firsts, seconds, stopped, spent, starts is not None
-        ),
-    )
-    if folder is not None:
-        _write(outcome, config, env.scene(best.best_state), first, folder)
-        if len(parts) == 1:
-            _write_tree(outcome, env, session, folder)
-        plain = {key: value for key, value in named.items() if isinstance(value, _PLAIN)}
-        write_text(folder / "config.yaml", sealed(config_text(plain)))
-    return outcome
-
-
-@dataclass(frozen=True)
->>>>>>> h-device
 class _Run:
     """A search run, in a folder that no other process writes into; see :func:`run_search`."""
 
@@ -224,7 +133,7 @@ class _Run:
     stopped: str = ""  # why the run ended early
 
     def __post_init__(self) -> None:
-        self.prior, starts = resolve_prior(self.prior), self.starts
+        self.prior, starts = resolve_prior(self.prior, self.config.device), self.starts
         self.fixed = {key: value for key, value in self.named.items() if key not in _LIMITS} | {"prior": self.prior}
         if starts is None:
             return

@@ -59,7 +59,6 @@ def run_demo(
 
     directory, started = Path(output), time.perf_counter()
     keys = [f"seed={seed}", f"workers={-(-workers // len(runs))}", "logger.report_scenes=0"]
-<<<<<<< HEAD
     keys += [f"device={device}", f"progress={progress}", "logger.checkpoint_every=1"]  # an interrupt ends runs at once
     tasks = [
         Task((name, [*words, *keys, f"output={directory / name}"]), f"the run {name!r}") for name, words in runs.items()
@@ -78,35 +77,14 @@ def run_demo(
         for label, tested in {"base": base, name: directory / name}.items():
             if label not in found:
                 print(f"measuring {scenes} samples of the prior {label!r}", file=sys.stderr, flush=True)
-                found[label] = measure_prior(
-                    ScenePrior.load(tested), scenes, num_steps=num_steps, seed=seed + SAMPLE_SEED, pool=pool
-                )
+                prior = cast(ScenePrior, resolve_prior(tested, device))
+                found[label] = measure_prior(prior, scenes, num_steps=num_steps, seed=seed + SAMPLE_SEED, pool=pool)
 
     processes = WorkerPool(f"{__name__}:post_train_aloud", None, workers=len(runs), environment=shares)
     with make_pool(workers, PHYSICS_TIMEOUT) as pool, processes:
         processes.map(tasks, done=measure)
     results = {name: _Finished(directory / name) for name in runs}
     measured = {label: found[label] for label in ("base", *runs)}
-=======
-    keys += [f"device={device}", f"progress={progress}"]
-    commands = {name: [*words, *keys, f"output={directory / name}"] for name, words in runs.items()}
-    base: ScenePrior | None = None
-    results: dict[str, _Finished] = {}
-    measured: dict[str, Measured] = {}
-    with make_pool(workers, PHYSICS_TIMEOUT) as pool, _post_training(commands) as processes:
-        for name, process in processes.items():
-            if status := process.wait():
-                raise TrainingError(f"the run {name!r} ended with status {status}; its message stands above")
-            results[name] = run = _Finished(directory / name)
-            base = cast(ScenePrior, resolve_prior(run.config["prior"], device)) if base is None else base
-            for label, tested in {"base": base, name: ScenePrior.load(directory / name).to(base.device)}.items():
-                if label not in measured:  # the other run goes on while samples are measured
-                    print(f"measuring {scenes} samples of the prior {label!r}", file=sys.stderr, flush=True)
-                    measured[label] = measure_prior(
-                        tested, scenes, num_steps=num_steps, seed=seed + SAMPLE_SEED, pool=pool
-                    )
-    assert base is not None
->>>>>>> h-device
     metrics = {
         **{name: part.figures for name, part in measured.items()},
         "runs": {name: run.metrics for name, run in results.items()},

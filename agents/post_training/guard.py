@@ -99,27 +99,12 @@ class Guard:
     @torch.no_grad()
     def loss(self, prior: ScenePrior) -> float:
         """Pretraining loss on the held-out scenes; the same timesteps and noise at every call."""
-<<<<<<< HEAD
-        generator, losses = Generator().manual_seed(self.seed), []
+        generator, losses, prompts = Generator().manual_seed(self.seed), [], self.prompts()
         for start in range(0, len(self.heldout), _CHUNK):
             rows = slice(start, start + _CHUNK)
-            text = None if self.prompts is None else prior.encode_prompts(self.prompts[rows])
+            text = None if prompts is None else prior.encode_prompts(prompts[rows])
             losses.append(prior.pretraining_loss(self.heldout[rows].to(prior.device), generator, "none", text=text))
         return float(torch.cat(losses).mean())
-=======
-        from agents.pretraining.trainer import heldout_loss
-
-        device = next(prior.parameters()).device
-        if (prompts := self.prompts()) is not None:
-            generator = Generator().manual_seed(self.seed)
-            chunks = [prompts[start : start + _CHUNK] for start in range(0, len(self.heldout), _CHUNK)]
-            losses = [
-                prior.pretraining_loss(x0.to(device), generator, "none", text=prior.encode_prompts(chunk))
-                for x0, chunk in zip(self.heldout.split(_CHUNK), chunks, strict=True)
-            ]
-            return float(torch.cat(losses).mean())
-        return heldout_loss(prior, self.heldout.to(device), seed=self.seed)
->>>>>>> h-device
 
     def check(
         self,

@@ -53,24 +53,10 @@ def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:
 class SeededPolicy(TensorDictModuleBase):
     """A policy for one batch, whose noise follows from a seed: an episode gets the same, whichever process runs it.
 
-<<<<<<< HEAD
-    It reads and writes the keys of ``policy``, but for ``action_log_prob``. All episodes are at the same step. The
+    It reads and writes the keys of ``policy``, but for ``action_log_prob``. All episodes start at its first call. The
     prompts are encoded once, at the first step; ``text`` has their tokens (B, L, W) and mask (B, L), None for a prior
     that reads none. ``seed`` is that of the run, ``iteration`` the number of the batch in it, from 0, and ``hook``
     changes the distributions as :meth:`DenoisingPolicy.claim_hook` makes it.
-=======
-    It reads and writes the keys of ``policy``, but for ``action_log_prob``. All episodes start at its first call. The
-    prompts are encoded once, at the first step.
-
-    Args:
-        policy: policy that draws the actions.
-        seed: seed of the run.
-        iteration: number of the batch in the run, from 0.
-        hook: change of the distributions, as :meth:`DenoisingPolicy.claim_hook` makes it.
-
-    Attributes:
-        text: tokens (B, L, W) and mask (B, L) that the network attends to; None when the prior reads no prompts.
->>>>>>> h-device
     """
 
     def __init__(self, policy: DenoisingPolicy, seed: int, iteration: int = 0, hook: Hook | None = None) -> None:

@@ -107,31 +107,14 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     >>> len(result.history), result.history[0]["log_ratio"]
     (2, 0.0)
     """
-<<<<<<< HEAD
     if config.batch_size % (count := launched_processes()):
         lower = config.batch_size // count * count
         nearest = f"{lower} or {lower + count}" if lower else str(count)
-=======
-    _check_shares(config.batch_size, launched_processes())
-    processes = ProcessGroup.join(str(resolve_device(config.device, None if prior is None else prior.device)))
-    with claimed(config.directory, "post_train") if processes.is_first else nullcontext():
-        trainer = PostTrainer(config, prior=prior)
-        try:
-            return trainer.run()
-        finally:
-            trainer.close()
-
-
-def _check_shares(batch_size: int, processes: int) -> None:
-    if batch_size % processes:
-        lower = batch_size // processes * processes
-        nearest = f"{lower} or {lower + processes}" if lower else str(processes)
->>>>>>> h-device
         raise InvalidInputError(
             f"batch_size={config.batch_size} is not a multiple of {count}, the number of processes; give "
             f"batch_size={nearest}, or another number of processes"
         )
-    processes = ProcessGroup.join(config.device)
+    processes = ProcessGroup.join(str(resolve_device(config.device, None if prior is None else prior.device)))
     claim = claimed(config.directory, "post_train") if processes.is_first else nullcontext()
     with claim, closing(PostTrainer(config, prior=prior)) as trainer:
         return trainer.run()

@@ -27,12 +27,8 @@ from agents.utils.checkpoints import check_tensors, derived_generator, load_chec
 from agents.utils.interrupts import Ending, finishing_steps
 from agents.utils.loggers import RunLogger
 from agents.utils.process_group import ProcessGroup, is_first_process
-<<<<<<< HEAD
 from agents.utils.weight_average import WeightAverage, averaged_weights
-=======
-from agents.utils.weight_average import AveragedWeights, WeightAverage
 from scene_envs.arrays import resolve_device, within_memory
->>>>>>> h-device
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed, write_json, write_text
 from scene_envs.progress import Progress
@@ -180,12 +176,7 @@ class Pretrainer:
             row: dict[str, float] = {}
             if self.step % config.logger.evaluate_every == 0 or last:
                 with self._averaged():
-<<<<<<< HEAD
-                    row["heldout"] = heldout_loss(self.prior, self.heldout_data.to(config.device))
-=======
                     row["heldout"] = heldout_loss(self.prior, self.heldout_data.to(self.device))
-                self.evaluations.append({"step": self.step, "heldout": row["heldout"]})
->>>>>>> h-device
             if self.step % config.logger.log_every == 0 or row:
                 row |= {"step": self.step, "loss": sum(running) / len(running), "gradient_norm": norm}
                 row |= {"learning_rate": learning_rate_at(self.step - 1, config), "seconds": round(self.seconds, 1)}
