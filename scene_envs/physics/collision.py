@@ -91,9 +91,9 @@ class Collider:
         order = np.lexsort((value, inverse))  # sums do not depend on the order of the contacts
         count = np.bincount(inverse, minlength=len(keys))
         total = np.bincount(inverse[order], weights=value[order], minlength=len(keys))
+        deepest = value[order][np.cumsum(count) - 1]
         one, two = np.divmod(keys, max(len(objects), 1))
-        deepest: Array = value[order][np.cumsum(count) - 1]
-        return ObjectOverlaps(one, two, deepest, total, count, unmeasured)
+        return ObjectOverlaps(one, two, deepest, np.asarray(total), count, unmeasured)
 
     def contacts(self, objects: Objects, pairs: ObjectPairs, fine: Mask) -> Contacts:
         """Near parts of the ``pairs`` of objects: fine parts for the pairs in ``fine`` (P,), coarse ones for others."""

@@ -62,10 +62,8 @@ def _start(chunk: Chunk, engine: str) -> tuple[Physics, Objects, NDArray[np.bool
 
 def _budgets(chunk: Chunk, objects: Objects, pairs: ObjectPairs) -> list[Budget]:
     """Work that the simulation of each scene may take."""
-    if chunk.units is not None:
-        return [Budget(units) for units in chunk.units.tolist()]
-    scenes = [np.flatnonzero(objects.scene == index) for index in range(len(chunk))]
-    return [Budget(simulation_units(objects[rows], pairs.among(rows))) for rows in scenes]
+    units = simulation_units(objects, pairs, len(chunk)) if chunk.units is None else chunk.units
+    return list(map(Budget, units.tolist()))
 
 
 def feasibility_kernel(
@@ -248,12 +246,11 @@ def projection_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
 
 def units_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
     """Units of simulation that each scene may spend; 0 for heaps, which are not simulated."""
-    units = np.zeros(len(chunk))
-    for index in range(len(chunk)):
-        physics, objects, _ = _start(chunk[index : index + 1], engine)
-        if not heaps(physics.collider, objects).any():
-            units[index] = simulation_units(objects, physics.collider.pairs(objects))
-    return {"units": units, "valid": np.ones(len(chunk), dtype=bool)}
+    physics, objects, valid = _start(chunk, engine)
+    spread = np.array([bool(heaps(physics.collider, objects[objects.scene == row]).any()) for row in range(len(chunk))])
+    objects = objects[~spread[objects.scene]]
+    units = simulation_units(objects, physics.collider.pairs(objects), len(chunk))
+    return {"units": np.where(spread, 0.0, units), "valid": valid}
 
 
 def _scatter(chunk: Chunk, objects: Objects, values: NDArray[Any]) -> NDArray[Any]:

@@ -285,7 +285,7 @@ class Overlaps:
         for size in np.unique(self._size).tolist():
             members = np.flatnonzero(self._size == size)
             self._row[members] = np.arange(len(members))
-            self._corners[size] = padded([parts[index] for index in members])
+            self._corners[size] = padded([parts[index] for index in members.tolist()])
 
     def __call__(
         self, kind: Index, rotation: Array, translation: Array, first: Index, second: Index, scene: Index | None = None
@@ -381,8 +381,8 @@ class Overlaps:
             sizes = self._size[part[:, side]]
             for size, corners in self._corners.items():
                 some = np.flatnonzero(sizes == size)
-                reach = apply(corners[self._row[part[some, side]]], along[some])
-                width[some] += reach.max(axis=1)
+                reach = corners[self._row[part[some, side]]] @ along[some, :, None]
+                width[some] += reach.max(axis=1)[:, 0]
         for row in np.flatnonzero(~(np.abs(width - depth) <= _CERTAIN)):
             turn = rotation[row, 0].T
             one, other = (self._parts[index] for index in part[row])
