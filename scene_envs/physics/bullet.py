@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.errors import PhysicsError
-from scene_envs.physics.engines import CONVERGED, DAMPING, ITERATIONS, Course, Moved, gravity
+from scene_envs.physics.engines import CONVERGED, DAMPING, ITERATIONS, Course, Moved, fallen, gravity
 from scene_envs.physics.parts import (
     FRICTION,
     LevelGeometry,
@@ -263,6 +263,11 @@ class BulletEngine:
         if duration > _LONG and creeping.any() and not course.budget.is_spent:
             moved = self._run(cluster, fine, duration, course, _Settings(_USUAL_STEP, CONVERGED))
         return moved
+
+    def fall(self, duration: float) -> tuple[float, float]:
+        """See :class:`~scene_envs.physics.engines.Engine`."""
+        steps = max(1, round(duration / _USUAL_STEP))
+        return fallen(steps, _USUAL_STEP), steps
 
     def _run(self, cluster: Objects, fine: Mask, duration: float, course: Course, settings: _Settings) -> Moved:
         with self._lock:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from scene_envs.arrays import Array, Index, Mask, ranges
-from scene_envs.physics.engines import DAMPING, Course, Moved, gravity
+from scene_envs.physics.engines import DAMPING, Course, Moved, fallen, gravity
 from scene_envs.physics.parts import (
     FRICTION,
     LibraryGeometry,
@@ -473,3 +473,8 @@ class MujocoEngine:
         translation[rows] = np.nan if lost else end[:, :3] - apply(rotation[rows], center[category])
         angle[rows] = angle_between(start[:count], after)
         return Moved(rotation, translation, angle)
+
+    def fall(self, duration: float) -> tuple[float, float]:
+        """See :class:`~scene_envs.physics.engines.Engine`."""
+        steps = max(1, round(duration / TIMESTEP))
+        return fallen(steps, TIMESTEP), steps
