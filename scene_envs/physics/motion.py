@@ -21,8 +21,6 @@ from scene_envs.scene_types import SceneType
 _FAR, _MARGIN = 2e-3, 1e-3
 """An object that moved further than ``_FAR`` (m) may have met others, whose boxes are within ``_MARGIN`` (m) of the box
 around its way."""
-_APART = 1e-4
-"""Objects of which none carries another, and which are all further apart than this (m), fall alike, without contact."""
 _MEETINGS = 4
 """Largest number of simulations of a scene; each after the first repeats objects that met."""
 _REACH = 0.05
@@ -137,17 +135,19 @@ def _falls(objects: Objects, pairs: ObjectPairs, rest: Rest, way: float) -> tupl
     others fall.
     """
     falling = ~(rest.still | objects.fixed)
-    if not falling.any():
-        return falling, falling
-    touching = pairs.gap < _APART
-    falling[pairs.first[touching]] = falling[pairs.second[touching]] = False
     _spread(falling, pairs.first, pairs.second)
+    loose, struck = falling.copy(), np.zeros(len(objects), dtype=bool)
+    if not falling.any():
+        return loose, struck
+    touching = pairs.depth > 0
+    loose[pairs.first[touching]] = loose[pairs.second[touching]] = False
+    _spread(loose, pairs.first, pairs.second)
     first, second = scene_pairs(objects)
     first, second = (rows[falling[first] | falling[second]] for rows in (first, second))
     low = pairs.low - _MARGIN
     low[falling, 2] -= way
     met = ((low[first] <= pairs.high[second]) & (low[second] <= pairs.high[first])).all(axis=1)
-    first, second, loose, struck = first[met], second[met], falling.copy(), np.zeros(len(objects), dtype=bool)
+    first, second = first[met], second[met]
     struck[first[~falling[first]]] = struck[second[~falling[second]]] = True
     _spread(loose, first, second)
     return loose, struck & rest.still
