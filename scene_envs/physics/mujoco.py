@@ -106,6 +106,9 @@ class _Models:
         option = spec.option
         option.timestep, option.impratio = TIMESTEP, 10.0
         option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
+        # a row of a contact has twelve numbers at most: sparse rows are a tenth to a quarter faster from two bodies on
+        option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+        option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
         _add_meshes(spec, self._parts)
         return spec
 
