@@ -44,7 +44,7 @@ MARGIN = 1e-3 / SCALE
 _PARKING = 1000.0
 """Height (Bullet units) of the first parked body; the next ones are above it."""
 _PARKING_STEP = 10.0 * SCALE
-_SPARE_BODIES = 12
+_SPARE_BODIES = 32
 _SPARE_FACTOR = 3
 """A pool is built again when it has more bodies than this many times the bodies that a scene needs, plus
 ``_SPARE_BODIES``: in every step Bullet compares the boxes of all bodies, including parked ones."""

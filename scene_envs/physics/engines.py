@@ -71,7 +71,7 @@ class Engine(Protocol):
         """
 
     def fall(self, duration: float) -> tuple[float, float]:
-        """Way (m) of an object in free fall by its steps of ``duration`` seconds, and the work (units) that one takes."""
+        """Way (m) of an object in free fall in ``duration`` seconds by the engine's steps, and its work in units."""
 
 
 def gravity(tilt: tuple[float, float]) -> Array:

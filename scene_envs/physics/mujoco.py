@@ -70,6 +70,8 @@ _TOO_MANY = 600_000
 more than a second."""
 Sizes = tuple[int, int, int, int]
 """Free bodies, geometries of each, fixed bodies, geometries of each."""
+_FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
+_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BADQ{name}")) for name in ("POS", "VEL", "ACC")]
 _GEOMETRY = ("geom_dataid", "geom_pos", "geom_quat", "geom_size", "geom_aabb", "geom_rbound")
 _NODE = ("bvh_aabb", "bvh_child", "bvh_depth", "bvh_nodeid")
 
@@ -153,6 +155,7 @@ class _Stage:
         self.model = models.compile(sizes, room)
         self.data = mujoco.MjData(self.model)
         self.model.geom_sameframe[:] = 0
+        self._warnings = self.data.warning.number  # a view
         self._fields = {name: getattr(self.model, name) for name in (*_GEOMETRY, *_NODE)}  # views of the model's arrays
         self._first, self._root = self.model.body_geomadr.astype(np.int64), self.model.body_bvhadr.astype(np.int64)
         self._idle = np.zeros((sizes[0], 7))
@@ -203,14 +206,12 @@ class _Stage:
     @property
     def is_full(self) -> bool:
         """Whether contacts were left out for want of room."""
-        full = mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL
-        return any(self.data.warning[index].number for index in full)
+        return bool(self._warnings[_FULL].any())
 
     @property
     def is_lost(self) -> bool:
         """Whether the simulation diverged."""
-        bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-        return any(self.data.warning[index].number for index in bad)
+        return bool(self._warnings[_BAD].any())
 
     def run(self, count: int, duration: float, course: Course) -> Array:
         """Positions and orientations (count, 7) of the first free bodies at the end of a simulation, or at rest."""
@@ -463,7 +464,7 @@ class MujocoEngine:
             budget = replace(course.budget)
             with self._lock:
                 stage = self._models.stage(kind, some.fixed, room)
-                stage.place(kind, some.fixed, position, np.roll(start, 1, axis=1))
+                stage.place(kind, some.fixed, position, start[:, [3, 0, 1, 2]])
                 stage.weigh(self._library.mass[category], self._library.moments[category])
                 end = stage.run(count, duration, replace(course, budget=budget))
                 lost = stage.is_full or stage.is_lost
@@ -471,7 +472,7 @@ class MujocoEngine:
                 break
         course.budget.spent = budget.spent
         rotation, translation, angle = cluster.rotation.copy(), cluster.translation.copy(), np.zeros(len(order))
-        rows, after = order[:count], np.roll(end[:, 3:], -1, axis=1)
+        rows, after = order[:count], end[:, [4, 5, 6, 3]]
         rotation[rows] = times(matrices(after), self._library.axes[category].swapaxes(1, 2))
         translation[rows] = np.nan if lost else end[:, :3] - apply(rotation[rows], center[category])
         angle[rows] = angle_between(start[:count], after)
