@@ -91,9 +91,9 @@ class _Models:
     def __init__(self, parts: Sequence[Array], bodies: Sequence[_Body]) -> None:
         self._parts = parts
         self._stages: dict[tuple[Sizes, int], _Stage] = {}
-        spec = self._spec()
+        spec = scene_spec(parts)
         for body in bodies:
-            self._add(spec, body.parts, body.translation, np.roll(quaternions(body.rotation[None])[0], 1))
+            add_parts(_add_body(spec), body.parts, body.translation, np.roll(quaternions(body.rotation[None])[0], 1))
         model = spec.compile()
         self.geometries = {name: getattr(model, name).copy() for name in _GEOMETRY}
         self.first, self.count = model.body_geomadr[1:].astype(np.int64), model.body_geomnum[1:].astype(np.int64)
@@ -103,34 +103,17 @@ class _Models:
         owner = np.repeat(np.arange(len(bodies)), self.tree)
         self.nodes["bvh_nodeid"][: len(owner)] -= np.where(leaf[: len(owner)], self.first[owner], 0)
 
-    def _spec(self) -> Any:
-        spec = mujoco.MjSpec()
-        option = spec.option
-        option.timestep, option.impratio = TIMESTEP, 10.0
-        option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
-        # a row of a contact has twelve numbers at most: sparse rows are a tenth to a quarter faster from two bodies on
-        option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-        option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
-        _add_meshes(spec, self._parts)
-        return spec
-
-    @staticmethod
-    def _add(spec: Any, parts: Sequence[int], position: Any = (0, 0, 0), quaternion: Any = (1, 0, 0, 0)) -> Any:
-        body = spec.worldbody.add_body(mass=1.0, inertia=(1.0, 1.0, 1.0), explicitinertial=True)
-        for part in parts:
-            geometry = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{part}")
-            geometry.pos, geometry.quat = position, quaternion
-            geometry.friction[0] = FRICTION
-            geometry.solref[:], geometry.solimp[:] = SOLREF, SOLIMP
-        return body
-
     def compile(self, sizes: Sizes, room: int) -> Any:
         """A model with places for bodies of ``sizes``."""
-        spec = self._spec()
+        spec = scene_spec(self._parts)
+        # a row of a contact has twelve numbers at most: sparse rows are a tenth to a quarter faster from two bodies on
+        spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
         spec.memory = room * _ARENA * max(8, sizes[0])
         for free, bodies, geometries in ((True, *sizes[:2]), (False, *sizes[2:])):
             for _ in range(bodies):
-                body = self._add(spec, [0] * geometries)
+                body = _add_body(spec)
+                add_parts(body, [0] * geometries)
                 if free:
                     body.add_freejoint()
         return spec.compile()
@@ -230,11 +213,31 @@ class _Stage:
         return data.qpos.reshape(-1, 7)[:count].copy()  # type: ignore[no-any-return]
 
 
-def _add_meshes(spec: Any, parts: Sequence[Array]) -> None:
-    """Add meshes "part0", "part1", ... of the corners of parts."""
+def scene_spec(parts: Sequence[Array]) -> Any:
+    """A specification with the settings of exported files and meshes "part0", "part1", ... of the corners (V, 3) m of
+    parts.
+    """
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep, option.impratio = TIMESTEP, 10.0
+    option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
     for index, corners in enumerate(parts):
         vertices = _solid(corners).ravel().tolist()
         spec.add_mesh(name=f"part{index}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL, uservert=vertices)
+    return spec
+
+
+def _add_body(spec: Any) -> Any:
+    return spec.worldbody.add_body(mass=1.0, inertia=(1.0, 1.0, 1.0), explicitinertial=True)
+
+
+def add_parts(body: Any, parts: Sequence[int], position: Any = (0, 0, 0), quaternion: Any = (1, 0, 0, 0)) -> None:
+    """Add geometries of some parts of a specification to a body, with the contacts of exported files."""
+    for part in parts:
+        geometry = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{part}")
+        geometry.pos, geometry.quat = position, quaternion
+        geometry.friction[0] = FRICTION
+        geometry.solref[:], geometry.solimp[:] = SOLREF, SOLIMP
 
 
 def _solid(corners: Array) -> Array:
@@ -265,11 +268,10 @@ class Overlaps:
         self._parts, self._lock = parts, threading.Lock()
         self._count = np.array([len(ids) for ids in bodies])
         self._first, self._part = np.cumsum(self._count) - self._count, np.concatenate(bodies).astype(np.int64)
-        spec = mujoco.MjSpec()
+        spec = scene_spec(parts)
         spec.option.ccd_iterations, spec.option.disableflags = _ITERATIONS, mujoco.mjtDisableBit.mjDSBL_MULTICCD
         spec.memory = _PAIRS * _CONTACT_BYTES + _SEARCH_BYTES
-        _add_meshes(spec, parts)
-        spec.worldbody.add_body(mass=1.0, inertia=(1.0, 1.0, 1.0), explicitinertial=True)  # or there are no contacts
+        _add_body(spec)  # or there are no contacts
         for index in range(max(2 * _PAIRS, len(parts))):
             geometry = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, name=f"{index}", contype=0)
             geometry.meshname, geometry.conaffinity = f"part{index % len(parts)}", 0
