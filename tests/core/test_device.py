@@ -151,8 +151,8 @@ AT_THE_ENDS = {"mixed.py:initial_from_noise", "scene.py:is_welded"}
 
 
 @pytest.mark.parametrize(
-    "reward", ["clearance", "clutter", "coverage", "diversity", "feasible_share", "object_count", "penetration",
-               "prompt_match", "relation", "stability"],
+    "reward", ["clearance", "clutter", "diversity", "feasible_share", "object_count", "penetration",
+               "prompt_match", "stability"],
 )  # fmt: skip
 def test_rewards_score_on_the_device_of_the_scenes(
     reward: str, scenes: SceneBatch, monkeypatch: pytest.MonkeyPatch
