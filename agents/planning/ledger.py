@@ -114,18 +114,10 @@ def best_different(pool: Sequence[Member], count: int) -> list[Member]:
 
 
 class SearchBudget:
-    """Budget of expansions of a planner, and a record of their results.
+    """Budget of expansions of a planner, and a record of their results; an InvalidInputError if it is below 1.
 
     :attr:`left` is 0 when the budget is spent, when a state of value 1 (the largest value) was found, or when the
-    problem stops the search.
-
-    Args:
-        problem: problem to search.
-        budget: largest number of expansions.
-        progress: function to call after every round.
-
-    Raises:
-        InvalidInputError: the budget is below 1.
+    problem stops the search. ``progress`` is called after every round.
     """
 
     def __init__(self, problem: Searchable, budget: int, progress: Progress | None = None) -> None:
@@ -250,12 +242,8 @@ Settings = TypeVar("Settings", bound=type[PlannerSettings])
 
 
 def register_planner(name: str) -> Callable[[Settings], Settings]:
-    """Make a planner available as ``planner=name``; decorates the dataclass of the planner's keys.
-
-    The method ``make`` of the dataclass makes the planner.
-
-    Raises:
-        InvalidInputError: the name is not one word.
+    """Make a planner available as ``planner=name``. It decorates the dataclass of the keys, whose method ``make`` makes
+    the planner. An InvalidInputError if the name is not one word.
     """
     _PLANNERS.check_name(name, "beam")
     return _PLANNERS.adding(name)

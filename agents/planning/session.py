@@ -34,15 +34,9 @@ _HEAD = struct.Struct("<II")
 class Journal:
     """A file of records: the settings of the search, then the states of every round, in order.
 
-    A record that was being written when the process was killed is dropped.
-
-    Args:
-        path: journal file, created if it does not exist.
-        settings: settings on which the states depend, by name.
-
-    Raises:
-        InvalidInputError: the file was made with other settings.
-        CorruptFileError: the file is no journal, or is damaged before its end.
+    The file at ``path`` is created if it does not exist; the states depend on ``settings``, which are named. A record
+    that was being written when the process was killed is dropped. An InvalidInputError if the file was made with other
+    settings; a CorruptFileError if it is no journal, or is damaged before its end.
     """
 
     def __init__(self, path: str | os.PathLike[str], settings: Mapping[str, Any]) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any, cast
 
@@ -80,7 +78,7 @@ def run_demo(
                 prior = cast(ScenePrior, resolve_prior(tested, device))
                 found[label] = measure_prior(prior, scenes, num_steps=num_steps, seed=seed + SAMPLE_SEED, pool=pool)
 
-    processes = WorkerPool(f"{__name__}:post_train_aloud", None, workers=len(runs), environment=shares)
+    processes = WorkerPool("agents.cli.commands.demo:post_train_aloud", None, workers=len(runs), environment=shares)
     with make_pool(workers, PHYSICS_TIMEOUT) as pool, processes:
         processes.map(tasks, done=measure)
     results = {name: _Finished(directory / name) for name in runs}
@@ -108,28 +106,6 @@ class _Finished:
         self.metrics: dict[str, Any] = json.loads((directory / METRICS_NAME).read_text(encoding="utf-8"))
         self.goal = reward_label(self.config["reward"])
         self.algorithm = self.config["algorithm"]["name"].upper().replace("_", "-")
-
-
-class _Named(io.StringIO):
-    """Stream to stderr with the name of a run before each line."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__()
-        self._name, self._line, self._stderr = name, "", sys.stderr
-
-    def write(self, text: str) -> int:
-        *lines, self._line = (self._line + text).split("\n")
-        print(*(f"{self._name}: {line}\n" for line in lines), sep="", end="", file=self._stderr, flush=True)
-        return len(text)
-
-
-def post_train_aloud(run: tuple[str, Sequence[str]]) -> int:
-    """Exit status of ``scene-envs post-train`` for a name and keys; each line that it prints begins with the name."""
-    from agents.cli.main import main
-
-    name, words = run
-    with redirect_stderr(_Named(name)) as stream, redirect_stdout(stream):
-        return main(["post-train", *words])
 
 
 def _page(directory: Path, results: Mapping[str, _Finished], measured: Mapping[str, Measured]) -> Page:

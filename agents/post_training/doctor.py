@@ -163,7 +163,7 @@ def _step_rows(learner: Learner, batch: TensorDictBase) -> tuple[list[StepRow], 
 
 
 def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
-    algorithm, weight = config.algorithm, config.regularisation.pretraining_weight
+    algorithm, weight = config.algorithm, config.regularisation.weight or 0.0
     advice = []
     if report.log_ratio != 0:
         advice.append(

@@ -58,7 +58,7 @@ class Regularisation:
     @property
     def weight(self) -> float:
         """Coefficient of the pretraining loss on real scenes."""
-        return self.settings.pretraining_weight * self.state.factor
+        return (self.settings.weight or 0.0) * self.state.factor
 
     def accumulate(
         self,

@@ -250,12 +250,8 @@ def register_algorithm(
     The decorated class takes ``(settings, policy, stds)`` and extends :class:`agents.post_training.Algorithm` or one
     of its subclasses, such as :class:`agents.post_training.DDPO`.
 
-    Args:
-        name: name of letters, digits and underscores.
-        settings: dataclass of the algorithm's keys, with a sentence for each under ``Attributes:``.
-
-    Raises:
-        InvalidInputError: the name is not one word.
+    ``settings`` is the dataclass of the algorithm's keys, with a sentence for each under ``Attributes:``. An
+    InvalidInputError if the name is not one word of letters, digits and underscores.
     """
     _ALGORITHMS.check_name(name, "my_ddpo")
     return _ALGORITHMS.adding(name, lambda algorithm: (settings, algorithm))
@@ -341,11 +337,6 @@ class RegularisationSettings:
     def target(self) -> float | None:
         """Ratio of the held-out loss to the base prior's that ``hold`` names."""
         return None if self.hold is None else held_ratio(self.hold)
-
-    @property
-    def pretraining_weight(self) -> float:
-        """``weight``, or 0 for null; the config of a run has replaced null by the default of the algorithm."""
-        return self.weight or 0.0
 
 
 RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "progress", "reward_limits")
