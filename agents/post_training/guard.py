@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import derived_seed
@@ -20,8 +20,6 @@ _AT_ONCE = 32
 """Number of scenes sampled together."""
 _CLASSIFIERS = 3
 """Number of classifiers over which the accuracy is averaged."""
-_CHUNK = 256
-"""Number of held-out scenes per pass."""
 _STATE = ("base_loss", "base_samples", "best_reward", "best_score", "best_iteration")
 """Attributes of a guard that are kept in a checkpoint, beside its readings."""
 
@@ -99,12 +97,9 @@ class Guard:
     @torch.no_grad()
     def loss(self, prior: ScenePrior) -> float:
         """Pretraining loss on the held-out scenes; the same timesteps and noise at every call."""
-        generator, losses, prompts = Generator().manual_seed(self.seed), [], self.prompts()
-        for start in range(0, len(self.heldout), _CHUNK):
-            rows = slice(start, start + _CHUNK)
-            text = None if prompts is None else prior.encode_prompts(prompts[rows])
-            losses.append(prior.pretraining_loss(self.heldout[rows].to(prior.device), generator, "none", text=text))
-        return float(torch.cat(losses).mean())
+        from agents.pretraining.trainer import heldout_loss
+
+        return heldout_loss(prior, self.heldout.to(prior.device), self.prompts(), self.seed)
 
     def check(
         self,

@@ -40,6 +40,8 @@ FIELDS = ("step", "loss", "heldout", "gradient_norm", "learning_rate", "seconds"
 """Columns of ``log.csv``."""
 _MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe", "progress")
 """Keys that may change between a run and its continuation."""
+_CHUNK = 256
+"""Number of held-out scenes per pass."""
 _RESIDUAL = 512
 """Number of held-out scenes on which the residual error of the denoiser is measured."""
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -59,10 +61,15 @@ def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> No
 
 
 @torch.no_grad()
-def heldout_loss(prior: ScenePrior, x0: Tensor, seed: int = 1234, batch_size: int = 256) -> float:
-    """Pretraining loss on normalised scenes ``x0`` with timesteps and noise fixed by ``seed``."""
-    generator = Generator().manual_seed(seed)
-    losses = [prior.pretraining_loss(chunk, generator, "none") for chunk in x0.split(batch_size)]
+def heldout_loss(prior: ScenePrior, x0: Tensor, prompts: Sequence[str] | None = None, seed: int = 1234) -> float:
+    """Pretraining loss on normalised scenes ``x0`` (K, N, D), of ``prompts`` if given; ``seed`` fixes timesteps and
+    noise.
+    """
+    generator, losses = Generator().manual_seed(seed), []
+    for start in range(0, len(x0), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        text = None if prompts is None else prior.encode_prompts(prompts[rows])
+        losses.append(prior.pretraining_loss(x0[rows], generator, "none", text=text))
     return float(torch.cat(losses).mean())
 
 
