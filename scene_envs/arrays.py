@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, MutableMapping
+from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
     import torch
+    from torch import Tensor
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -61,6 +63,23 @@ def resolve_device(name: str | torch.device, auto: torch.device | None = None) -
         found = "" if count else "; torch finds no CUDA GPU"
         raise InvalidInputError(f"device={str(name)[:60]!r} is no device of this machine; use one of {here}{found}")
     return device
+
+
+@cache
+def _copies() -> MutableMapping[Tensor, dict[torch.device, Tensor]]:
+    from torch.utils.weak import WeakTensorKeyDictionary
+
+    return WeakTensorKeyDictionary()
+
+
+def constant_on(constant: Tensor, device: torch.device) -> Tensor:
+    """A tensor that is never written to, on ``device``; it is copied there once, not at every use."""
+    if constant.device == device:
+        return constant
+    copies = _copies().setdefault(constant, {})
+    if device not in copies:
+        copies[device] = constant.to(device)
+    return copies[device]
 
 
 def within_memory(work: Callable[[int], Result], size: int, key: str) -> Result:

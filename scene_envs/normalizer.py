@@ -8,23 +8,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.weak import WeakTensorKeyDictionary
 
+from scene_envs.arrays import constant_on
 from scene_envs.errors import InvalidInputError
 
 _ZERO_RANGE = 1e-6
 """Features whose range over the data is below this (m, or rotation entries) count as constant."""
-_COPIES: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
-
-
-def constant_on(constant: Tensor, device: torch.device) -> Tensor:
-    """A tensor that is never written to, on ``device``; it is copied there once, not at every use."""
-    if constant.device == device:
-        return constant
-    copies = _COPIES.setdefault(constant, {})
-    if device not in copies:
-        copies[device] = constant.to(device)
-    return copies[device]  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from scene_envs.arrays import constant_on
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.normalizer import constant_on
 
 UNMASKINGS = ("systematic", "even", "independent")
 """Ways to choose the masked slots that a step unmasks."""

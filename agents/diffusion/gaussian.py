@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from agents.diffusion.categorical import CategoricalProcess, fitted
+from scene_envs.arrays import constant_on
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.normalizer import constant_on
 
 PREDICTIONS = ("edm", "epsilon", "x0", "v")
 """Targets that a network may predict; see :meth:`GaussianProcess.x0_from_output`."""

@@ -36,10 +36,11 @@ from agents.priors.prior import (
     draw_noise,
     no_text,
 )
+from scene_envs.arrays import constant_on
 from scene_envs.datasets.prompts.facts import SIDES
 from scene_envs.datasets.prompts.parser import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.normalizer import Normalizer, constant_on
+from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type, members_of

@@ -86,7 +86,7 @@ def test_a_chain_stays_on_its_device(process: str, text: bool, monkeypatch: pyte
     with fake_gpu(monkeypatch) as crossings:
         to_gpu(prior)
         prior.sample(2, **how)  # constants are copied
-        assert "normalizer.py:constant_on" in crossings.to_gpu
+        assert "arrays.py:constant_on" in crossings.to_gpu
         table = prior.step_table(STEPS)
         encoded = prior.encode_prompts(["A scene with two cups."] * 2) if text else None
         x = prior.initial(2, 34, torch.Generator("cuda").manual_seed(0))
