@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask, ranges
-from scene_envs.physics.parts import SIZE_CLASSES, LevelGeometry, LibraryGeometry, PartTable, Rows, apply, times
+from scene_envs.physics.parts import SIZE_CLASSES, LibraryGeometry, PartTable, Rows, apply, times
 
 _CLASSES = len(SIZE_CLASSES) + 1
 _BLOCK = 1 << 16
@@ -165,24 +165,17 @@ class PlacedObjects:
 
 def place(library: LibraryGeometry, objects: Objects, level: Level) -> PlacedObjects:
     """Put the parts of ``objects`` into the world."""
-    levels: list[LevelGeometry] = [getattr(asset, level) for asset in library.assets]
-    counts = np.array([len(geometry.parts) for geometry in levels], dtype=np.int64)
-    count = counts[objects.category]
-    start = np.cumsum(count) - count
-    total = int(count.sum())
-    part = np.empty(total, dtype=np.int64)
-    low, high = np.empty((total, 3)), np.empty((total, 3))
-    for category in np.unique(objects.category):
-        rows = np.flatnonzero(objects.category == category)
-        geometry = levels[category]
-        target = start[rows][:, None] + np.arange(counts[category])
-        world = apply(objects.rotation[rows][:, None], geometry.vertices) + objects.translation[rows][:, None]
-        part[target] = geometry.ids
-        low[target] = np.minimum.reduceat(world, geometry.starts, axis=1)
-        high[target] = np.maximum.reduceat(world, geometry.starts, axis=1)
-    owner = np.repeat(np.arange(len(objects)), count)
+    ids = [getattr(asset, level).ids for asset in library.assets]
+    first, counts = (np.array(values)[objects.category] for values in ([i[0] for i in ids], [len(i) for i in ids]))
+    owner, part = ranges(first, counts)
     parts = PlacedParts(part, objects.rotation[owner], objects.translation[owner])
-    return PlacedObjects(parts, start, count, low, high)
+    low, high, classes = np.empty((len(part), 3)), np.empty((len(part), 3)), library.size_class[part]
+    for size, table in library.tables.items():
+        rows = np.flatnonzero(classes == size)
+        corners = parts.rotation[rows] @ table.vertices[library.row[part[rows]]].swapaxes(1, 2)
+        low[rows], high[rows] = corners.min(axis=2), corners.max(axis=2)
+    start = np.cumsum(counts) - counts
+    return PlacedObjects(parts, start, counts, low + parts.translation, high + parts.translation)
 
 
 def object_boxes(placed: PlacedObjects) -> tuple[Array, Array]:

@@ -129,9 +129,7 @@ class WarpEngine:
             state = _State(batch, self._library)
             scene, one, two = self._near(state)
             keys = torch.cat([~state.welded[..., None], state.category[..., None], state.pose], dim=-1)
-            apart = (
-                keys[scene, one] - keys[scene, two]
-            )  # welded first, then by category and pose: no matter which slots
+            apart = keys[scene, one] - keys[scene, two]  # welded first, then by category and pose, not by slots
             row = (apart != 0).long().argmax(dim=1, keepdim=True)
             swap = apart.gather(1, row).squeeze(1) > 0
             one, two = torch.where(swap, two, one), torch.where(swap, one, two)
