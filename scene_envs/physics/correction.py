@@ -32,7 +32,7 @@ _TOUCHING = 1e-3
 """Difference in height (m) of parts that may touch."""
 _FALL = 0.03
 """An object higher than this (m) above all others is not moved down."""
-_MIN_SPREAD = 0.02
+_MIN_SPREAD = 0.05
 """Smallest standard deviation along an axis, as a share of the largest one."""
 _LEVEL = (1.0, 1.0, 50.0)
 """Cost of moving furniture by a metre along each axis: vertical moves are avoided."""
@@ -48,13 +48,17 @@ _BLOCK = 1 << 24
 _DOWN, _UP, _BLOCKED = 3.0, 1.4, 20.0
 """Cost factors of a way down out of a fixed object, of a vertical way of two free ones, and of one out of the
 workspace."""
+_STILL = 1e-7
+"""Subtracted from speeds, so that none is zero."""
+_SWEEPS = 4
+"""Parts that an object may pass one after the other on its way out of another object."""
 _FAR = 10.0
 """Length (m) of a way that has no end."""
 _SLACK = 300.0
 """Cost of a metre of overlap relative to a metre of distance, squared in the objective."""
 _MET = 1e-6
 """A plane broken by less than this (m) is met."""
-_ROUNDS, _STEPS = 3, 30
+_ROUNDS, _STEPS = 3, 100
 """Rounds of the least-distance problem, after each of which broken planes join it, and steps of each."""
 _OUTSIDE = 0.05
 """Objects further than this (m) outside the workspace are not moved back inside."""
@@ -307,7 +311,7 @@ class _Parts(NamedTuple):
             (low_a, high_a), (low_b, high_b) = self.spans(things, axis)
             sides += [low_b - high_a, low_a - high_b]
         gap, side, after = _met(torch.stack(sides), axes[..., None], _at(way, self.pair))
-        crossing = after < -_FLOATING
+        crossing = (after < -_FLOATING) | (side < 4)
         count = 6 * way.shape[1]
         nearest = gap.new_full((count + 1,), torch.inf)
         nearest.scatter_reduce_(0, torch.where(crossing, count, 6 * self.pair + side), gap, "amin")
@@ -496,14 +500,19 @@ def _ways_out(things: _Things, first: Tensor, second: Tensor, bounds: Tensor, co
     for found, extreme in zip(directions[-2:], (deepest, shallow), strict=True):
         found[:, torch.where(gap == extreme[parts.pair], parts.pair, len(first))] = normal
     directions = directions[..., :-1]
-    leave = torch.zeros_like(gap).repeat(len(directions), 1)
+    enter, leave = gap.new_empty(2, len(directions), len(gap))
     for rows, gaps, normals in groups:
         some = _at(directions, parts.pair[rows])
-        rate = normals / gaps.clamp(max=-_MET).neg_()[:, None]
-        rate = _dot(some[:, None].unbind(dim=2), rate.unbind(dim=1)).amax(dim=1)  # (D, q), 1 / length of the way out
-        leave[:, rows] = torch.where(gap[rows] < 0, 1.0 / rate.clamp(min=1.0 / _FAR), 0.0)
+        speed = _dot(some[:, None].unbind(dim=2), normals.unbind(dim=1)).sub_(_STILL)  # (D, K, q)
+        when, nearer = -gaps / speed, speed < 0
+        enter[:, rows] = torch.where(nearer, when, -torch.inf).amax(dim=1)
+        leave[:, rows] = when.masked_fill_(nearer, torch.inf).amin(dim=1)
     pair = parts.pair.expand_as(leave)
-    length = torch.zeros_like(directions[:, 0]).scatter_reduce(1, pair, leave, "amax")
+    length = torch.zeros_like(directions[:, 0])
+    for _ in range(_SWEEPS):
+        here = _at(length, parts.pair) + _MET
+        length = length.scatter_reduce(1, pair, torch.where((enter < here) & (leave > here), leave, 0.0), "amax")
+    length = length.clamp(max=_FAR)
     price = _weights(things, (first, second), directions, length, bounds) * (directions * cost[:, None]).norm(dim=1)
     best = (length * price).argmin(dim=0)
     way = _chosen(directions, best) * (length.gather(0, best[None]) + CLEARANCE)
@@ -564,10 +573,10 @@ def _solved(ends: Tensor, direction: Tensor, needed: Tensor, found: Tensor, limi
 
     Each plane has two ``ends`` (2R,), which it pulls along ``direction`` (3, 2R).
     """
-    free = (limits[0] < limits[1]).any(dim=0).to(needed)
-    planes = (torch.zeros_like(free).index_add_(0, ends, torch.ones_like(direction[0])) * free)[ends]
-    step = 1.0 / (planes.view(2, -1).sum(dim=0) + _SLACK**-2)
-    kept, target, places = 1.0 - step * _SLACK**-2, step * needed, ends.expand(3, -1)
+    places, size = ends.expand(3, -1), direction.abs()
+    planes = torch.zeros_like(limits[0]).scatter_add_(1, places, size) * (limits[0] < limits[1])
+    step = 1.0 / ((size * _at(planes, ends)).sum(dim=0).view(2, -1).sum(dim=0) + _SLACK**-2)
+    kept, target = 1.0 - step * _SLACK**-2, step * needed
 
     def moved(multipliers: Tensor) -> Tensor:
         pull = direction * multipliers.repeat(2)
