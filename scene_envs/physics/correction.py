@@ -43,8 +43,8 @@ _HEAP = 2e7
 _SCENES = 512
 """Scenes corrected together."""
 _BLOCKS = {"cpu": 1 << 18}
-"""Products of corners and face directions computed together: on a CPU their arrays stay in the cache."""
 _BLOCK = 1 << 24
+"""Products of corners and face directions computed together: on a CPU their arrays stay in the cache."""
 _DOWN, _UP, _BLOCKED = 3.0, 1.4, 20.0
 """Cost factors of a way down out of a fixed object, of a vertical way of two free ones, and of one out of the
 workspace."""
@@ -154,7 +154,7 @@ def _geometry(library: AssetLibrary, device: torch.device) -> _Geometry:
         for columns in [(table.vertices, table.normals, table.offsets)]
     )
     row = torch.from_numpy(geometry.row)
-    return _Geometry(*(column.contiguous().to(device) for column in (*columns, size_class, row)), tables)
+    return _Geometry._make((*(column.contiguous().to(device) for column in (*columns, size_class, row)), tables))
 
 
 class _Things(NamedTuple):
@@ -183,7 +183,8 @@ class _Things(NamedTuple):
         boxes = torch.where(_at(geometry.part, category) < 0, none, boxes)
         fixed = fixed.flatten()[at] | geometry.static[category]
         translation = batch.translations.flatten(0, 1)[at].T.contiguous()
-        return cls(geometry, tuple(batch.tensor.shape[:2]), at, category, fixed, rotation, translation, box, boxes)
+        slots = len(batch), batch.tensor.shape[1]
+        return cls(geometry, slots, at, category, fixed, rotation, translation, box, boxes)
 
     def take(self, rows: Tensor) -> _Things:
         """The objects ``rows``."""
@@ -287,11 +288,11 @@ class _Parts(NamedTuple):
             for first in range(start, start + total, max(1, block // size)):
                 rows = slice(first, min(start + total, first + max(1, block // size)))
                 origin = _at(things.translation, owners[0, rows])
-                sides = tuple(
+                a, b = (
                     _Side(table, row, _at(things.rotation, owner), _at(things.translation, owner) - origin)
                     for table, row, owner in zip(tables, parts[:, rows], owners[:, rows], strict=True)
                 )
-                yield order[rows], sides
+                yield order[rows], (a, b)
             start += total
 
     def gaps(self, things: _Things) -> Iterator[_Group]:
@@ -325,7 +326,7 @@ class _Parts(NamedTuple):
         return torch.cat([rows // 6, others.pair]), torch.cat([nearest[rows], gap]), normal
 
     def spans(self, things: _Things, axis: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """(Q,) m, lowest and highest coordinate of both parts along an axis, from the translation of the first object."""
+        """(Q,) m, lowest and highest coordinate of both parts along an axis, from the first object on."""
         away = things.translation[axis, self.second] - things.translation[axis, self.first]
         low, high = things.boxes[:, axis, self.two, self.second] + away
         return tuple(things.boxes[:, axis, self.one, self.first]), (low, high)
@@ -433,7 +434,7 @@ def _reach(lower: Tensor, upper: Tensor, room: Tensor, start: Tensor, ground: Te
 
 
 def _furniture_apart(things: _Things, pieces: Tensor, fixed: Tensor, bounds: Tensor) -> _Things:
-    """The objects after overlapping ``pieces`` of furniture that are not ``fixed`` moved apart, with what is on them."""
+    """The objects after ``pieces`` of furniture that are not ``fixed`` moved apart, with what is on them."""
     furniture = things.take(pieces)._replace(fixed=fixed)
     moves = _apart(furniture, bounds, torch.tensor(_LEVEL).to(bounds)) - furniture.translation
     scenes, slots = things.slots
