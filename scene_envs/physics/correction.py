@@ -557,15 +557,22 @@ def _nearest(
     loose[first] = loose[second] = False
     loose = loose | ((home < low - _OUTSIDE) | (home > high + _OUTSIDE)).any(dim=0)
     low, high = (torch.where(loose, sign * torch.inf, (limit - home) * scale) for sign, limit in ((-1, low), (1, high)))
+    # A plane along an axis between a fixed object and a free one limits the free one exactly.
+    is_limit = (direction.abs().amax(dim=0) > 1.0 - _MET) & (things.fixed[first] | things.fixed[second])
+    away = torch.where(things.fixed[first], direction, -direction)
+    owner = torch.where(things.fixed[first], second, first).expand(3, -1)
+    least = torch.where(is_limit & (away > 0.5), needed, -torch.inf)
+    most = torch.where(is_limit & (away < -0.5), -needed, torch.inf)
+    low, high = low.scatter_reduce(1, owner, least, "amax"), high.scatter_reduce(1, owner, most, "amin")
     limits = torch.stack([low, high]).masked_fill(things.fixed, 0.0)
     found = torch.zeros_like(needed)
-    used, x = needed > 0, torch.zeros_like(home)
+    used, x = ~is_limit & (needed > 0), torch.zeros_like(home)
     for _ in range(_ROUNDS):
         rows = torch.nonzero(used)[:, 0]
         ends = torch.cat([second[rows], first[rows]])
         normal = _at(direction, rows)
         x, found[rows] = _solved(ends, torch.cat([normal, -normal], dim=1), needed[rows], found[rows], limits)
-        used = used | (needed - (direction * (_at(x, second) - _at(x, first))).sum(dim=0) > _MET)
+        used = used | ~is_limit & (needed - (direction * (_at(x, second) - _at(x, first))).sum(dim=0) > _MET)
     return home + x / scale
 
 
