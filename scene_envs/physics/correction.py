@@ -466,7 +466,13 @@ def _apart(things: _Things, bounds: Tensor, cost: Tensor) -> Tensor:
     touched = torch.zeros_like(things.fixed)
     rows = torch.nonzero(way.any(dim=0))[:, 0]
     touched[first[rows]] = touched[second[rows]] = True
-    rows = torch.nonzero(touched[first] | touched[second])[:, 0]
+    chosen = touched[first] | touched[second]
+    beside = first.new_zeros(len(touched))  # neighbours must not be pushed into what is fixed
+    for ends in (first, second):
+        beside.index_add_(0, ends, chosen.long())
+    free_end = torch.where(things.fixed[first], second, first)
+    chosen |= (things.fixed[first] | things.fixed[second]) & (beside[free_end] > 0)
+    rows = torch.nonzero(chosen)[:, 0]
     parts = _Parts.near(things, first[rows], second[rows], _REACH, _REACH)
     pair, gap, direction = parts.planes(things, _at(way, rows))
     return _nearest(things, first[rows[pair]], second[rows[pair]], direction, CLEARANCE - gap, bounds, cost)
