@@ -199,7 +199,7 @@ def overlapping() -> SceneBatch:
 
 
 def test_moves_are_the_corrections_times_the_strength(overlapping: SceneBatch) -> None:
-    moves = corrections(overlapping, STD.double().numpy())
+    moves = corrections(overlapping, STD)
     for strength in (1.0, 0.5):
         shift = PhysicsGuidance(strength)(40, 50, lambda: overlapping, STD)
         assert shift is not None
