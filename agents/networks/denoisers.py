@@ -208,7 +208,7 @@ class MixedDenoiser(nn.Module):
 # -- packing: slots that are known to be empty are left out of a batch ----------------------------
 
 
-_CHUNKS = 4
+_CHUNKS = 3
 """Parts of a batch on the CPU, each as wide as its fullest scene."""
 
 

@@ -262,12 +262,17 @@ def joint_attention(
     """
     if relations is None or gathered is None or mask is None:
         return F.scaled_dot_product_attention(query, key, value, attn_mask=mask).transpose(1, 2).flatten(-2)
-    weights = (query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5 + mask).softmax(dim=-1)
+    scores = torch.baddbmm(
+        mask.expand(*query.shape[:-1], -1).flatten(0, 1), query.flatten(0, 1), key.flatten(0, 1).mT,
+        alpha=query.shape[-1] ** -0.5,
+    )  # fmt: skip
+    weights = scores.softmax(dim=-1)
+    attended = (weights @ value.flatten(0, 1)).unflatten(0, query.shape[:2]).transpose(1, 2).flatten(-2)
     slots = relations.shape[1]
-    among = weights[:, :, -slots:, -slots:].transpose(1, 2)  # (B, N, heads, N)
+    among = weights.unflatten(0, query.shape[:2])[:, :, -slots:, -slots:].transpose(1, 2)  # (B, N, heads, N)
     message = gathered((among @ relations).flatten(-2))
-    attended = (weights @ value).transpose(1, 2).flatten(-2)
-    return attended + F.pad(message, (0, 0, attended.shape[1] - slots, 0))
+    others = attended.shape[1] - slots
+    return attended + (F.pad(message, (0, 0, others, 0)) if others else message)
 
 
 # -- contacts -------------------------------------------------------------------------------------
