@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from agents.diffusion import CategoricalProcess, GaussianProcess
+from agents.diffusion.categorical import one_hot
 from agents.diffusion.gaussian import Moments
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.text import Text, TextEncoder
@@ -36,18 +36,27 @@ class Denoiser(nn.Module):
         self.process = process
         self.precision = torch.float32
 
-    def output(self, x_t: Tensor, t: Tensor) -> Tensor:
+    def output(self, x_t: Tensor, t: Tensor | int) -> Tensor:
         """The raw network output (B, N, D), in the units of ``process.target``."""
         process = self.process
         alpha, _ = process.rates(t, x_t)
-        level = (process.sigma[t.cpu()] / process.alpha[t.cpu()]).to(x_t.device)
+        level = noise_levels(process, t, x_t)
         with autocast(x_t, self.precision):
             result: Tensor = self.network(process.network_input(x_t, t), x_t / alpha, level)
         return result.to(x_t.dtype)
 
-    def forward(self, x_t: Tensor, t: Tensor) -> Tensor:
-        """The denoised scene x_0 (B, N, D), normalised."""
+    def forward(self, x_t: Tensor, t: Tensor | int) -> Tensor:
+        """The denoised scene x_0 (B, N, D), normalised; ``t`` (B,), or one timestep of all scenes."""
         return self.process.x0_from_output(x_t, t, self.output(x_t, t))
+
+
+def noise_levels(process: GaussianProcess, t: Tensor | int, like: Tensor) -> Tensor:
+    """(B,) noise-to-signal ratio of scenes ``like`` (B, N, D) at ``t``."""
+    at = t.cpu() if isinstance(t, Tensor) else t
+    ratio: tuple[Tensor] = process.once(
+        t, like, "ratio", lambda: ((process.sigma[at] / process.alpha[at]).to(like.device),)
+    )
+    return ratio[0].expand(len(like))
 
 
 EMPTY_SLOTS = ("attended", "dropped")
@@ -141,33 +150,36 @@ class MixedDenoiser(nn.Module):
         return self._mean[t[:, None], states], self._std[t[:, None], states]
 
     def output(
-        self, x_t: Tensor, t: Tensor, observed: Observed | None = None, text: Text | None = None
+        self, x_t: Tensor, t: Tensor | int, observed: Observed | None = None, text: Text | None = None
     ) -> tuple[Tensor, Tensor]:
         """The raw pose output, in the units of ``poses.target``, and logits.
 
         Args:
             x_t: (B, N, 12 + K), observed entries in place.
-            t: (B,) timesteps.
+            t: (B,) timesteps, or one of all scenes.
             observed: entries that carry no noise.
             text: (B, L, W) tokens and (B, L) their mask.
         """
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
         alpha, _ = self.poses.rates(t, pose)
-        ratio = (self.poses.sigma[t.cpu()] / self.poses.alpha[t.cpu()]).to(x_t.device)
+        ratio = noise_levels(self.poses, t, x_t)
         level = ratio[:, None].expand(pose.shape[:2])
         scaled = self.poses.network_input(pose, t)
         position = pose / alpha
         if observed is not None:
             exact = observed.pose[..., None]
-            scaled = torch.where(exact, self.poses.network_input(pose, torch.zeros_like(t)), scaled)
+            scaled = torch.where(
+                exact, self.poses.network_input(pose, torch.zeros_like(t) if isinstance(t, Tensor) else 0), scaled
+            )
             position = torch.where(exact, pose, position)
             level = torch.where(observed.pose, torch.zeros_like(level), level)
-        time = 250.0 * ratio.log() if self.reads_log_noise else (t - 1).to(pose.dtype)
+        steps = t if isinstance(t, Tensor) else torch.full((len(pose),), t, device=pose.device)
+        time = 250.0 * ratio.log() if self.reads_log_noise else (steps - 1).to(pose.dtype)
         inputs = [scaled, states, position, level, *([] if observed is None else [observed.flags()])]
         if self.drops_empty:
             output, logits = self._on_present(inputs, time, text)
             count = self.categories.categories
-            certain = _CERTAIN * (F.one_hot(states.clamp(max=count - 1), count).float() - 1.0)
+            certain = _CERTAIN * (one_hot(states, count, logits.dtype) - 1.0)
             return output, torch.where((states < count)[..., None], certain, logits)
         return self._run(inputs, time, text)
 
@@ -197,12 +209,19 @@ class MixedDenoiser(nn.Module):
         return run_packed(present, run, (POSE_FEATURES, self.categories.categories))
 
     def forward(
-        self, x_t: Tensor, t: Tensor, observed: Observed | None = None, text: Text | None = None
+        self, x_t: Tensor, t: Tensor | int, observed: Observed | None = None, text: Text | None = None
     ) -> tuple[Tensor, Tensor]:
         """The clean pose (B, N, 12), normalised, and the logits of the clean category (B, N, K)."""
         output, logits = self.output(x_t, t, observed, text)
-        moments = self.moments(state_of(x_t[..., POSE_FEATURES:]), t)
-        return self.poses.x0_from_output(x_t[..., :POSE_FEATURES], t, output, moments), logits
+        pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
+        if isinstance(t, Tensor) or self._mean is None or self._std is None or self.poses.prediction != "edm":
+            moments = self.moments(states, t) if isinstance(t, Tensor) else None
+            return self.poses.x0_from_output(pose, t, output, moments), logits
+        of_states = self._mean[t], self._std[t]
+        tables = self.poses.once(
+            t, pose, "states", lambda: (torch.stack(self.poses.output_scaling(t, pose, of_states), 1),)
+        )
+        return self.poses.x0_from_output(pose, t, output, None, tables[0][states].unbind(-2)), logits
 
 
 # -- packing: slots that are known to be empty are left out of a batch ----------------------------

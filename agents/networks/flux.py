@@ -141,7 +141,8 @@ class DoubleStreamBlock(nn.Module):
         """
         scene, text = scene + self.scene.modality, text + self.text.modality
         rates = [stream.rates(condition) for stream in (self.text, self.scene)]
-        words, slots = (s.heads_of(x, r) for s, x, r in zip((self.text, self.scene), (text, scene), rates, strict=True))
+        words: Any = self.text.heads_of(text, rates[0])
+        slots: Any = self.scene.heads_of(scene, rates[1])
         query = slots[0] if words[0] is None else torch.cat([words[0], slots[0]], dim=2)
         key, value = (torch.cat([words[part], slots[part]], dim=2) for part in (1, 2))
         attended = joint_attention(query, key, value, mask, relations, self.gathered)
@@ -525,8 +526,9 @@ class MixedFlux(nn.Module):
         chosen: Iterator[Tensor | None] = itertools.repeat(None) if biases is None else iter(biases)
         reaches = words is not None and self.config.text_reach == "all"
         if words is not None:
+            last = self.double_blocks[-1]
             for block in self.double_blocks:
-                mask = _mask(next(chosen), text_mask, scene.slot_mask, words.shape[1], slots, block.text.finishes)
+                mask = _mask(next(chosen), text_mask, scene.slot_mask, words.shape[1], slots, block is not last or reaches)
                 slots, words = block(slots, words, condition, mask, scene.pairs)
         count = words.shape[1] if reaches and words is not None else 0
         slots = torch.cat([words, slots], dim=1) if reaches and words is not None else slots

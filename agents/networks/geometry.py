@@ -405,7 +405,7 @@ class Contacts(FluxModule):
         shape, fresh = both.shape[1:], not torch.is_grad_enabled()
         seen = _product(self.seen.weight, features.movedim(-1, 0), here, here.square(), there, there.square())
         seen = F.silu(seen.unflatten(1, shape).add_(early).add_(early_other), fresh)
-        first, _, last = self.touch
+        first, last = (layer for layer in self.touch if isinstance(layer, nn.Linear))
         offered = F.silu(linear_of_pairs(first, seen), fresh).flatten(1)
         level = along.abs() - _TYPICAL * (1.0 + last.bias[:, None, None, None])
         gaps = level.flatten(1).addmm_(last.weight, offered, alpha=-_TYPICAL).unflatten(1, shape) / both

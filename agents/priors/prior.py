@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from torch import Generator, Tensor, nn
@@ -90,6 +90,22 @@ class DenoiserOutput:
     logits: Tensor | None = None
 
 
+class Frame(NamedTuple):
+    """What is known of the entries of scenes of N slots.
+
+    Attributes:
+        known: (N, D) bool, entries that are clamped.
+        values: (N, D) what they are clamped to; 0 elsewhere.
+        free: (N,) bool, slots that no fixed object has.
+        moving: (N, D) 1 for entries that are not known, 0 for the others.
+    """
+
+    known: Tensor
+    values: Tensor
+    free: Tensor
+    moving: Tensor
+
+
 class ScenePrior(nn.Module, ABC):
     """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
 
@@ -150,6 +166,8 @@ class ScenePrior(nn.Module, ABC):
         self.residual = residual
         fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
         self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
+        self._frames: dict[Any, Frame] = {}
+        self._strides: dict[Any, tuple[ResidualVariance | None, tuple[float, float, Tensor]]] = {}
         schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
         self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         distribution = timestep_distribution(config.timesteps, config.prediction)
@@ -285,11 +303,31 @@ class ScenePrior(nn.Module, ABC):
 
     def clamp(self, x: Tensor) -> Tensor:
         """``x`` (B, N, D) with its known entries set to their values."""
-        count = len(self.scene_type.fixed)
-        x = torch.where(self.is_constant.to(x.device), torch.zeros_like(x), x)
-        if count:
-            x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
-        return x
+        frame = self.frame(x)
+        return torch.where(frame.known, frame.values, x)
+
+    def frame(self, x: Tensor) -> Frame:
+        """What is known of the entries of scenes ``x`` (B, N, D); computed once for each number of slots."""
+        key = x.shape[1], x.device, x.dtype
+        if key not in self._frames:
+            known, count = self.known(x.shape[1]).to(x.device), len(self.scene_type.fixed)
+            values = torch.cat([self._fixed[:count].to(x), x.new_zeros(x.shape[1] - count, known.shape[1])])
+            free = torch.arange(x.shape[1], device=x.device) >= count
+            self._frames[key] = Frame(known, values, free, (~known).to(x))
+        return self._frames[key]
+
+    def stride(self, t: int, previous: int, eta: float, like: Tensor) -> tuple[float, float, Tensor]:
+        """Weights of x_0 and x_t in the mean of a reverse step, and its std, () or (F,); computed once.
+
+        Errors are those of :meth:`~agents.diffusion.GaussianProcess.posterior`.
+        """
+        key = t, previous, eta, like.device
+        known = self._strides.get(key)
+        if known is None or known[0] is not self.residual:
+            residual = None if self.residual is None else self.residual.at(t)
+            x0_weight, xt_weight, std = self.process.posterior_weights(t, previous, residual, eta)
+            known = self._strides[key] = (self.residual, (x0_weight, xt_weight, std.to(like.device)))
+        return known[1]
 
     def encode(self, batch: SceneBatch) -> Tensor:
         """Normalised x_0 (B, N, D) of scenes.
