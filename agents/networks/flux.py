@@ -526,9 +526,9 @@ class MixedFlux(nn.Module):
         chosen: Iterator[Tensor | None] = itertools.repeat(None) if biases is None else iter(biases)
         reaches = words is not None and self.config.text_reach == "all"
         if words is not None:
-            last = self.double_blocks[-1]
-            for block in self.double_blocks:
-                mask = _mask(next(chosen), text_mask, scene.slot_mask, words.shape[1], slots, block is not last or reaches)
+            for place, block in enumerate(self.double_blocks, 1):
+                asks = reaches or place < len(self.double_blocks)
+                mask = _mask(next(chosen), text_mask, scene.slot_mask, words.shape[1], slots, asks)
                 slots, words = block(slots, words, condition, mask, scene.pairs)
         count = words.shape[1] if reaches and words is not None else 0
         slots = torch.cat([words, slots], dim=1) if reaches and words is not None else slots
