@@ -1,9 +1,16 @@
-"""Types of numpy arrays, and ranges of their rows."""
+"""Types of numpy arrays, ranges of their rows, and devices by name. The module does not import torch."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
+
+from scene_envs.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    import torch
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -19,3 +26,35 @@ def ranges(first: Index, counts: Index) -> tuple[Index, Index]:
     """
     of = np.repeat(np.arange(len(counts)), counts)
     return of, np.arange(len(of)) + (first - (np.cumsum(counts) - counts))[of]
+
+
+def resolve_device(name: str | torch.device, auto: torch.device | None = None) -> torch.device:
+    """The torch device of a name such as ``cpu``, ``cuda`` or ``cuda:1``.
+
+    ``"auto"`` is ``auto``, the device of something that exists already, or else the GPU where torch finds one and the
+    CPU where it finds none.
+
+    Raises:
+        InvalidInputError: this machine has no such device; the message says which it has.
+
+    >>> str(resolve_device("cpu"))
+    'cpu'
+    """
+    import torch
+
+    if name == "auto":
+        return auto or torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    try:
+        device = torch.device(name)
+        if device.type == "cuda":  # without a context on it: each process of a run has a GPU of its own
+            usable = (device.index or 0) < count
+        else:
+            usable = device.type == "cpu" or torch.empty(1, device=device).device.type != "meta"  # which stores no data
+    except Exception:  # each backend has errors of its own
+        usable = False
+    if not usable:
+        here = ", ".join(["auto", "cpu", *["cuda"][:count], *(f"cuda:{index}" for index in range(count))])
+        found = "" if count else "; torch finds no CUDA GPU"
+        raise InvalidInputError(f"device={str(name)[:60]!r} is no device of this machine; use one of {here}{found}")
+    return device

@@ -1,4 +1,4 @@
-"""Files: atomic writes, digests, the claim of a folder by one writer, tensors, pages, and where scenes are in a folder.
+"""Files: atomic writes, digests, the claim of a folder by one writer, tensors, pages, the cache, places of scenes.
 
 The module does not import torch.
 """
@@ -85,6 +85,24 @@ def read_sealed(path: str | os.PathLike[str]) -> str:
     if _SEAL.startswith(head[: len(_SEAL)]) and head and head != f"{_SEAL}{hashlib.sha256(rest.encode()).hexdigest()}":
         raise CorruptFileError(f"{str(path)!r} was cut off or changed after it was written (checksum)")
     return rest if head.startswith(_SEAL) else text
+
+
+def cache_folder() -> Path:
+    """Folder of what runs share: ``$SCENE_ENVS_CACHE``, else ``scene_envs`` in the user's cache folder."""
+    if chosen := os.environ.get("SCENE_ENVS_CACHE"):
+        return Path(chosen).expanduser()
+    if os.name == "nt" and (local := os.environ.get("LOCALAPPDATA")):
+        return Path(local) / "scene_envs" / "cache"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scene_envs"
+
+
+def trim_folder(folder: Path, size: int) -> None:
+    """Remove the files of ``folder`` that were used longest ago, until the others hold at most ``size`` bytes."""
+    found = sorted(((path.stat(), path) for path in folder.glob("[!.]*")), key=lambda item: -item[0].st_mtime)
+    for state, path in found:
+        size -= state.st_size
+        if size < 0:
+            path.unlink(missing_ok=True)
 
 
 def is_file(path: Path) -> bool:

@@ -36,6 +36,7 @@ from agents.configuration.composition import (
 from agents.configuration.prior_names import find_prior, split_name
 from agents.utils.interrupts import Terminated, terminable
 from scene_envs import __version__
+from scene_envs.arrays import resolve_device
 from scene_envs.errors import (
     CorruptFileError,
     InvalidInputError,
@@ -78,10 +79,10 @@ _MINIMA = {
 }
 """The least that a number may be, where a config's ``LEAST`` does not say otherwise."""
 _DEVICE = (
-    r"(cpu|cuda|mps|xpu|hpu|mtia|xla|ipu|hip|ve|vulkan|maia|lazy|meta|privateuseone|npu|mlu|musa|mkldnn|opengl|opencl|"
+    r"(auto|cpu|cuda|mps|xpu|hpu|mtia|xla|ipu|hip|ve|vulkan|maia|lazy|meta|privateuseone|npu|mlu|musa|mkldnn|opengl|opencl|"
     r"ideep|fpga)(:\d{1,4})?"
 )
-"""Devices that torch knows."""
+"""Devices that torch knows, and their automatic choice."""
 _DATASETS = ("data", "heldout", "regularisation.scenes")
 _GRAMMAR = "grammar"
 
@@ -349,9 +350,9 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
         _check_name("scene type", scene, known_scenes)
     for mask in [getattr(settings, "mask", None), *(getattr(settings, "masks", None) or [])]:
         _check_name("mask", mask, known_masks)
-    device = getattr(settings, "device", "cpu")
+    device = getattr(settings, "device", "auto")
     if not re.fullmatch(_DEVICE, device):
-        raise InvalidInputError(f"device={device[:60]!r} is no torch device; give cpu, cuda or cuda:1")
+        raise InvalidInputError(f"device={device[:60]!r} is no torch device; give auto, cpu, cuda or cuda:1")
     if hasattr(settings, "progress"):
         require_one_of(settings, "progress", PROGRESS_STYLES)
     if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
@@ -368,8 +369,8 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     for key in ("reward", "objective"):
         if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
             _ask_for_files(key, getattr(settings, key), allow_local)
-    if device != "cpu":
-        check_device(device)
+    if device not in ("auto", "cpu"):  # neither needs torch to be checked
+        resolve_device(device)
 
 
 def _check_numbers(settings: Any) -> None:
@@ -417,25 +418,3 @@ def _check_guidance(settings: Any) -> None:
         check_claim_guidance(prompt, strength)
     if strength := getattr(settings, "physics_guidance", 0.0):
         check_physics_guidance(strength)
-
-
-def check_device(name: str) -> None:
-    """Raise unless torch knows the device and this machine has it.
-
-    Raises:
-        InvalidInputError: the device cannot be used; the message says which would work.
-
-    >>> check_device("cpu")
-    """
-    import torch
-
-    try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
-    except Exception:  # each backend has errors of its own
-        here = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
-        raise InvalidInputError(
-            f"device={str(name)[:60]!r} is not a torch device of this machine; use one of {', '.join(here)}"
-        ) from None
-    if device.type == "meta":
-        raise InvalidInputError("device='meta' stores no data; give cpu or cuda")

@@ -576,10 +576,10 @@ class DeviceKeys:
     """Device of the networks.
 
     Attributes:
-        device: torch device, such as cpu, cuda or cuda:1.
+        device: torch device, such as cpu, cuda or cuda:1; auto is the GPU where torch finds one, else the CPU.
     """
 
-    device: str = "cpu"
+    device: str = "auto"
 
 
 @dataclass

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.normalizer import constant_on
 
 UNMASKINGS = ("systematic", "even", "independent")
 """Ways to choose the masked slots that a step unmasks."""
@@ -124,9 +125,11 @@ class CategoricalProcess:
         """Whether a category is either unchanged or masked, so that a visible category is the clean one."""
         return not bool(_replaced(self.schedule.keep, self.schedule.mask).any())
 
-    def rates(self, start: Tensor | int, end: Tensor | int) -> tuple[Tensor, Tensor]:
+    def rates(
+        self, start: Tensor | int, end: Tensor | int, device: torch.device | None = None
+    ) -> tuple[Tensor, Tensor]:
         """keep and mask probability of the stride ``start`` -> ``end`` (start < end), float64."""
-        keep, mask = self.schedule.keep, self.schedule.mask
+        keep, mask = (constant_on(rate, device or rate.device) for rate in (self.schedule.keep, self.schedule.mask))
         kept = keep[end] / keep[start].clamp(min=_TINY)
         masked = 1.0 - (1.0 - mask[end]) / (1.0 - mask[start]).clamp(min=_TINY)
         masked = masked.clamp(0.0, 1.0)
@@ -176,7 +179,7 @@ class CategoricalProcess:
         """
         keep_s, mask_s = self._rates_at(previous, x_t)
         keep_t, mask_t = self._rates_at(t, x_t)
-        keep_ts, mask_ts = (_broadcast(rate, x_t) for rate in self.rates(_on_cpu(previous), _on_cpu(t)))
+        keep_ts, mask_ts = (_broadcast(rate, x_t) for rate in self.rates(previous, t, x_t.device))
         k, masked = self.categories, (x_t == self.categories).unsqueeze(-1)
         here = one_hot(x_t, k, torch.float64)
         likelihood = torch.where(masked, mask_t, keep_t * here + _replaced(keep_t, mask_t) / k)  # q(x_t | x_0)
@@ -189,9 +192,8 @@ class CategoricalProcess:
 
     def _rates_at(self, t: Tensor | int, like: Tensor) -> tuple[Tensor, Tensor]:
         """Cumulative keep and mask at ``t``, shaped (B, ..., 1) for states ``like`` (B, ...); () for an int."""
-        at = _on_cpu(t)
-        keep, mask = (_broadcast(rate[at], like) for rate in (self.schedule.keep, self.schedule.mask))
-        return keep, mask
+        keep, mask = (constant_on(rate, like.device)[t] for rate in (self.schedule.keep, self.schedule.mask))
+        return _broadcast(keep, like), _broadcast(mask, like)
 
     def log_prob(self, x_s: Tensor, probs: Tensor) -> Tensor:
         """(...) log-probability of the states ``x_s`` under ``probs`` (..., K + 1)."""
@@ -234,13 +236,9 @@ def _replaced(keep: Tensor, mask: Tensor) -> Tensor:
     return torch.where(rest > 1e-12, rest, torch.zeros_like(rest))
 
 
-def _on_cpu(t: Tensor | int) -> Tensor | int:
-    return t.cpu() if isinstance(t, Tensor) else t
-
-
 def _broadcast(rate: Tensor, like: Tensor) -> Tensor:
-    """``rate`` (B,) as (B, ..., 1) on the device of ``like`` (B, ...); a single number stays on the CPU."""
-    return fitted(rate.to(like.device), like).unsqueeze(-1) if rate.ndim else rate
+    """``rate`` (B,) as (B, ..., 1) beside ``like`` (B, ...); a single number () as it is."""
+    return fitted(rate, like).unsqueeze(-1) if rate.ndim else rate
 
 
 def one_hot(states: Tensor, count: int, dtype: torch.dtype) -> Tensor:

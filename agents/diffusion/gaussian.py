@@ -13,6 +13,7 @@ from torch import Tensor
 
 from agents.diffusion.categorical import CategoricalProcess, fitted
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.normalizer import constant_on
 
 PREDICTIONS = ("edm", "epsilon", "x0", "v")
 """Targets that a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
@@ -265,11 +266,10 @@ class GaussianProcess:
     def rates(self, t: Tensor | int, like: Tensor) -> tuple[Tensor, Tensor]:
         """alpha_t and sigma_t, shaped to broadcast against ``like`` (B, N, D)."""
         if isinstance(t, int):
-            kept: tuple[Tensor, Tensor] = self.once(
-                t, like, "rates", lambda: (self.alpha[t].to(like.device), self.sigma[t].to(like.device))
-            )
+            alpha, sigma = (constant_on(rate, like.device) for rate in (self.alpha, self.sigma))
+            kept: tuple[Tensor, Tensor] = self.once(t, like, "rates", lambda: (alpha[t], sigma[t]))
             return kept
-        alpha, sigma = self.alpha.to(like.device)[t], self.sigma.to(like.device)[t]
+        alpha, sigma = constant_on(self.alpha, like.device)[t], constant_on(self.sigma, like.device)[t]
         return fitted(alpha, like), fitted(sigma, like)
 
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
@@ -411,7 +411,8 @@ class GaussianProcess:
     def _moments(self, like: Tensor, moments: Moments | None) -> Moments:
         if moments is not None:
             return moments
-        return self.preconditioning.mean.to(like), self.preconditioning.std.to(like)
+        mean, std = (constant_on(x, like.device) for x in (self.preconditioning.mean, self.preconditioning.std))
+        return mean.to(like.dtype), std.to(like.dtype)
 
 
 def timestep_weights(distribution: str, schedule: NoiseSchedule, mean: float, std: float) -> Tensor:

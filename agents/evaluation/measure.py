@@ -122,6 +122,7 @@ def evaluate(
     batch_size: int = 64,
     pool: PhysicsPool | None = None,
     ready: bool = True,
+    device: str = "auto",
 ) -> dict[str, float]:
     """Sample a prior and measure its raw samples.
 
@@ -135,14 +136,16 @@ def evaluate(
         batch_size: number of scenes denoised at once.
         pool: worker processes for physics; None computes in this process.
         ready: whether to also project and settle the samples.
+        device: torch device of the network; ``"auto"`` is that of a prior that is given, and for a name the GPU where
+            torch finds one, else the CPU.
 
     Returns:
         The figures of :func:`measure_samples`, and ``num_steps``.
     """
-    sampler = cast(Sampler, resolve_prior(prior))
+    sampler = cast(Sampler, resolve_prior(prior, device))
     if reference is None:
         reference = grammar_scenes(sampler.scene_type, count, seed=seed)
-    samples = sampler.sample(count, num_steps=num_steps, seed=seed, batch_size=batch_size)
+    samples = sampler.sample(count, num_steps=num_steps, seed=seed, batch_size=batch_size).to("cpu")
     figures = measure_samples(samples, reference, floor=floor, pool=pool, ready=ready)
     return {"num_steps": float(num_steps), **figures}
 

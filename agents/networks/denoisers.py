@@ -52,11 +52,9 @@ class Denoiser(nn.Module):
 
 def noise_levels(process: GaussianProcess, t: Tensor | int, like: Tensor) -> Tensor:
     """(B,) noise-to-signal ratio of scenes ``like`` (B, N, D) at ``t``."""
-    at = t.cpu() if isinstance(t, Tensor) else t
-    ratio: tuple[Tensor] = process.once(
-        t, like, "ratio", lambda: ((process.sigma[at] / process.alpha[at]).to(like.device),)
-    )
-    return ratio[0].expand(len(like))
+    alpha, sigma = process.rates(t, like)
+    ratio = sigma / alpha
+    return ratio.reshape(t.shape) if isinstance(t, Tensor) else ratio.expand(len(like))
 
 
 EMPTY_SLOTS = ("attended", "dropped")

@@ -126,7 +126,7 @@ def _search(
     progress: Progress | None,
 ) -> SearchOutcome:
     """:func:`run_search` with its settings resolved, in a folder that no other process writes into."""
-    loaded = resolve_prior(prior)
+    loaded = resolve_prior(prior, config.device)
     fixed = {key: value for key, value in named.items() if key not in _LIMITS} | {"prior": loaded}
     if starts is not None:
         if starts.scene_type.name != loaded.scene_type.name:

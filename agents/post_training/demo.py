@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from agents.post_training.report import (
     PHYSICS_TIMEOUT,
@@ -30,6 +30,7 @@ from agents.post_training.report import (
 from agents.post_training.run_files import METRICS_NAME, write_metrics
 from agents.priors.prior import ScenePrior
 from rewards import reward_label
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import TrainingError
 from scene_envs.files import read_sealed
 
@@ -42,7 +43,7 @@ def run_demo(
     seed: int = 0,
     workers: int = 2,
     *,
-    device: str = "cpu",
+    device: str = "auto",
     progress: str = "bar",
     scenes: int = 24,
     num_steps: int = 50,
@@ -68,8 +69,8 @@ def run_demo(
             if status := process.wait():
                 raise TrainingError(f"the run {name!r} ended with status {status}; its message stands above")
             results[name] = run = _Finished(directory / name)
-            base = ScenePrior.load(run.config["prior"]) if base is None else base
-            for label, tested in {"base": base, name: ScenePrior.load(directory / name)}.items():
+            base = cast(ScenePrior, resolve_prior(run.config["prior"], device)) if base is None else base
+            for label, tested in {"base": base, name: ScenePrior.load(directory / name).to(base.device)}.items():
                 if label not in measured:  # the other run goes on while samples are measured
                     print(f"measuring {scenes} samples of the prior {label!r}", file=sys.stderr, flush=True)
                     measured[label] = measure_prior(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,7 +38,7 @@ class Guard:
         heldout: (K, N, D) normalised real scenes that are not used by the regularisation.
         limit: largest ratio before the run counts as over-optimised; no checkpoint above it is kept.
         seed: seed of the fixed timesteps and noise.
-        prompts: one prompt of each held-out scene; None measures without prompts.
+        prompts: gives one prompt of each held-out scene; the loss is measured without prompts where it gives None.
         samples: settings for sampling and measuring; None measures the loss alone.
         limits: largest excess of each figure of samples over that of the base prior, by name.
         target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
@@ -57,7 +57,7 @@ class Guard:
         heldout: Tensor,
         limit: float,
         seed: int,
-        prompts: Sequence[str] | None = None,
+        prompts: Callable[[], Sequence[str] | None] = lambda: None,
         samples: SampleCheck | None = None,
         limits: Mapping[str, float] | None = None,
         target: float = math.inf,
@@ -76,6 +76,11 @@ class Guard:
         self.readings: list[GuardReading] = []
         self.best_reward = self.best_score = float("-inf")
         self.best_iteration = 0
+
+    @property
+    def started(self) -> bool:
+        """Whether the base prior has been measured."""
+        return not math.isnan(self.base_loss)
 
     def start(self, base: ScenePrior) -> None:
         """Measure the base prior."""
@@ -107,12 +112,12 @@ class Guard:
         from agents.pretraining.trainer import heldout_loss
 
         device = next(prior.parameters()).device
-        if self.prompts is not None:
+        if (prompts := self.prompts()) is not None:
             generator = Generator().manual_seed(self.seed)
-            chunks = [self.prompts[start : start + _CHUNK] for start in range(0, len(self.heldout), _CHUNK)]
+            chunks = [prompts[start : start + _CHUNK] for start in range(0, len(self.heldout), _CHUNK)]
             losses = [
-                prior.pretraining_loss(x0.to(device), generator, "none", text=prior.encode_prompts(prompts))
-                for x0, prompts in zip(self.heldout.split(_CHUNK), chunks, strict=True)
+                prior.pretraining_loss(x0.to(device), generator, "none", text=prior.encode_prompts(chunk))
+                for x0, chunk in zip(self.heldout.split(_CHUNK), chunks, strict=True)
             ]
             return float(torch.cat(losses).mean())
         return heldout_loss(prior, self.heldout.to(device), seed=self.seed)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ from agents.utils.checkpoints import load_checkpoint
 from agents.utils.process_group import ProcessGroup
 from rewards import PromptMatch, RewardContext, RewardOutput, evaluate_reward, learned_parts, reward_label
 from rewards.process import close_reward
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.files import page_part, page_template
 from scene_envs.scene import SceneBatch
 
@@ -100,7 +101,7 @@ def post_train_and_compare(
             print(text, file=sys.stderr, flush=True)
 
     started = time.perf_counter()
-    base = ScenePrior.load(config.prior if prior is None else prior)
+    base = cast(ScenePrior, resolve_prior(config.prior if prior is None else prior, config.device))
     result = post_train(config, prior=base)
     if not ProcessGroup.current().is_first:
         return result.metrics
@@ -214,7 +215,7 @@ def measure_prior(
     raw = prior.sample(
         count, prompt=prompts, guidance=guidance, claim_guidance=claim_guidance, physics_guidance=0.0,
         num_steps=num_steps, slots=slots, seed=seed,
-    )  # fmt: skip
+    ).to("cpu")  # fmt: skip
     left_out: dict[str, str] = {}
     ready: ReadyResult | None = None
     scored: RewardOutput | None = None

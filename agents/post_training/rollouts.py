@@ -53,7 +53,7 @@ def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:
 class SeededPolicy(TensorDictModuleBase):
     """A policy for one batch, whose noise follows from a seed: an episode gets the same, whichever process runs it.
 
-    It reads and writes the keys of ``policy``, but for ``action_log_prob``. All episodes are at the same step. The
+    It reads and writes the keys of ``policy``, but for ``action_log_prob``. All episodes start at its first call. The
     prompts are encoded once, at the first step.
 
     Args:
@@ -71,7 +71,7 @@ class SeededPolicy(TensorDictModuleBase):
         self.in_keys, self.out_keys = policy.in_keys, ["action", "slot_log_prob"]
         self.policy, self.hook, self.iteration = policy, hook, iteration
         self.text: Text | None = None
-        self._seed = stream_seed(seed, "noise", iteration)
+        self._seed, self._step = stream_seed(seed, "noise", iteration), 0
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write an action and its log-probability.
@@ -80,7 +80,7 @@ class SeededPolicy(TensorDictModuleBase):
             TrainingError: the prior gave values that are not finite.
         """
         scene, processes = tensordict["scene"], ProcessGroup.current()
-        step = self.policy.step_of(int(tensordict["timestep"][0]))
+        step, self._step = self._step, self._step + 1
         if step == 0:
             self._generator = Generator(scene.device).manual_seed(self._seed)
             self.text = self.policy.read(tensordict["prompt"]) if "prompt" in self.in_keys else None
@@ -129,6 +129,8 @@ def collect(
         prompts: one prompt per row; None lets the environment draw them.
     """
     core, rank = env.core, ProcessGroup.current().rank
+    for timestep in core.table.timesteps.tolist():
+        policy.step_of(timestep)  # raises where environment and policy have other steps
     env.set_seed(stream_seed(seed, "start", iteration) + rank * core.num_envs)
     seeded = SeededPolicy(policy, seed, iteration, policy.claim_hook(prompts, core.slots))
     start = env.reset(prompts=prompts)
@@ -148,7 +150,7 @@ def _verdict(env: DenoisingTorchRLEnv) -> dict[str | tuple[str, str], Tensor]:
     assert result.batch is not None
     assert result.score is not None
     scenes, score, scorer = result.batch, result.score, env.core.scorer
-    judged = score.object_flags.get("judged", scenes.is_free).to(device)
+    judged = score.object_flags.get("judged", scenes.is_free)
     credited = judged.clone() if scorer.averages_objects else torch.ones_like(judged)
     credited[:, : len(scenes.scene_type.fixed)] = False  # fixed slots are not drawn
     entries: dict[str | tuple[str, str], Tensor] = {
@@ -167,8 +169,8 @@ def _verdict(env: DenoisingTorchRLEnv) -> dict[str | tuple[str, str], Tensor]:
 
 
 def finished_scenes(batch: TensorDictBase) -> SceneBatch:
-    """The finished scenes of a batch, on the CPU."""
-    return SceneBatch(batch["finished"][:, -1].cpu(), batch["scene_type"])
+    """The finished scenes of a batch, on its device."""
+    return SceneBatch(batch["finished"][:, -1], batch["scene_type"])
 
 
 def text_of(states: TensorDictBase) -> Text | None:
@@ -178,8 +180,8 @@ def text_of(states: TensorDictBase) -> Text | None:
 
 
 def gathered_scenes(batch: TensorDictBase) -> SceneBatch:
-    """The finished scenes of all processes."""
-    scenes = finished_scenes(batch)
+    """The finished scenes of all processes, on the CPU."""
+    scenes = finished_scenes(batch).to("cpu")
     return SceneBatch(gather_rows(scenes.tensor), scenes.scene_type)
 
 

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -40,6 +40,8 @@ from agents.utils.loggers import make_logger
 from agents.utils.process_group import ProcessGroup, launched_processes
 from agents.utils.weight_average import AveragedWeights
 from rewards import reward_label
+from scene_envs.arrays import resolve_device
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed
 from scene_envs.scene import SceneBatch
@@ -61,7 +63,7 @@ class PostTrainResult:
     """Result of a finished run.
 
     Attributes:
-        prior: best prior within the guard's limit, also in ``directory / "prior"``.
+        prior: best prior within the guard's limit, on the device of the run; also in ``directory / "prior"``.
         history: one row of the log per iteration.
         metrics: contents of ``metrics.json``.
         directory: folder of the run.
@@ -103,7 +105,7 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     (2, 0.0)
     """
     _check_shares(config.batch_size, launched_processes())
-    processes = ProcessGroup.join(config.device)
+    processes = ProcessGroup.join(str(resolve_device(config.device, None if prior is None else prior.device)))
     with claimed(config.directory, "post_train") if processes.is_first else nullcontext():
         trainer = PostTrainer(config, prior=prior)
         try:
@@ -137,11 +139,13 @@ class PostTrainer:
         self.config, self.plain = config, config.plain()
         self.directory = config.directory
         self.processes = ProcessGroup.current()
-        base = ScenePrior.load(config.prior if prior is None else prior)
+        base = cast(ScenePrior, resolve_prior(config.prior if prior is None else prior, config.device))
+        self.device = base.device
         if config.prompt is not None and not base.conditional:
             raise no_text(base.scene_type, str(config.prompt))
+        self._base: ScenePrior | None = base  # until the guard has measured it
         self.base_name = short_name(base.loaded_as) if base.loaded_as else ""
-        self.prior = deepcopy(base).to(config.device).eval()
+        self.prior = deepcopy(base).eval()
         policy = DenoisingPolicy(
             self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,
             claim_guidance=config.claim_guidance,
@@ -176,7 +180,8 @@ class PostTrainer:
         else:
             if self.processes.is_first:
                 write_text(self.directory / "config.yaml", sealed(config_text(self.plain)))
-            self.guard.start(self.prior)
+            if self.learner.learned:  # a reward that learns is another one later
+                self._start_guard()
             self._keep(self.prior)  # the best prior so far is the base
         title = f"post-train {self.prior.scene_type.name}"
         started = time.perf_counter() - self.seconds
@@ -221,7 +226,7 @@ class PostTrainer:
             if config.prompt == "data":
                 large = torch.nonzero(batch.counts > slots)[:, 0].tolist()
                 check_object_count([text for i in large for text in prompts(i)], self.prior.scene_type, slots)
-        x0 = self.prior.encode(batch.to(config.device))
+        x0 = self.prior.encode(batch.to(self.device))
         self.scenes = SceneBank.split(x0, config.guard.scenes, prompts)
         self.learner.deal_prompts(self.scenes)
         self.learner.begin_rewards(batch[: len(self.scenes.train)], first=not reuse_scenes)
@@ -281,7 +286,7 @@ class PostTrainer:
             scenes.heldout,
             config.guard.limit,
             stream_seed(config.seed, "guard"),
-            scenes.heldout_prompts(),
+            scenes.heldout_prompts,
             check,
             config.guard.sample_limits(config.algorithm.sample_limits),
             math.inf if target is None else target,
@@ -322,7 +327,14 @@ class PostTrainer:
             return self.rollbacks > _MAX_ROLLBACKS
         return self.config.guard.action == "stop" and self.guard.over_limit_at is not None
 
+    def _start_guard(self) -> None:
+        """Measure the base prior, with which later checks are compared; done before the first of them."""
+        if self._base is not None and not self.guard.started:
+            self.guard.start(deepcopy(self._base).eval())
+        self._base = None
+
     def _check(self, batch: TensorDict, *, sample: bool) -> None:
+        self._start_guard()
         since = self.guard.readings[-1].iteration if self.guard.readings else 0
         recent = [row["reward"] for row in self.history[since:] if math.isfinite(row["reward"])]
         reward = sum(recent) / len(recent) if recent else float("nan")
@@ -451,4 +463,4 @@ class PostTrainer:
                 beyond=self.guard.over_limit_at,
                 highest=self.learner.largest_reward(),
             )
-        return PostTrainResult(self._best(), self.history, metrics, self.directory, self.config)
+        return PostTrainResult(self._best().to(self.device), self.history, metrics, self.directory, self.config)

@@ -29,6 +29,7 @@ from agents.utils.interrupts import Ending, finishing_steps
 from agents.utils.loggers import RunLogger, make_logger
 from agents.utils.process_group import ProcessGroup, is_first_process
 from agents.utils.weight_average import AveragedWeights, WeightAverage
+from scene_envs.arrays import resolve_device
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed, write_json, write_text
 from scene_envs.progress import Progress
@@ -121,14 +122,15 @@ class Pretrainer:
     def __init__(self, config: PretrainConfig, data: TrainingData, heldout: Tensor, prior: ScenePrior) -> None:
         self.config = config
         self.data, self.heldout_data = data, heldout
-        self.processes = ProcessGroup.join(config.device)
+        self.device = resolve_device(config.device)
+        self.processes = ProcessGroup.join(str(self.device))
         self.parts = self.processes.size * config.optimizer.compute.accumulate
         if config.batch_size % self.parts:
             raise InvalidInputError(
                 f"batch_size={config.batch_size} is not a multiple of {self.parts}, "
                 f"the {self.processes.size} process(es) times accumulate={config.optimizer.compute.accumulate}"
             )
-        self.prior = prior.to(config.device).train()
+        self.prior = prior.to(self.device).train()
         self.network: nn.Module = prior.denoiser
         settings = config.optimizer
         prior.denoiser.precision = _PRECISIONS[settings.compute.precision]
@@ -171,7 +173,7 @@ class Pretrainer:
         with self._averaged():
             count = len(self.heldout_data)  # scenes of a union are sorted by type
             rows = torch.linspace(0, count - 1, min(_RESIDUAL, count)).long()
-            self.prior.fit_residual(self.heldout_data[rows].to(self.config.device))
+            self.prior.fit_residual(self.heldout_data[rows].to(self.device))
         self.prior.denoiser.precision = torch.float32
         return self.save_prior()
 
@@ -205,7 +207,7 @@ class Pretrainer:
             row: dict[str, float] = {}
             if self.step % config.logger.evaluate_every == 0 or last:
                 with self._averaged():
-                    row["heldout"] = heldout_loss(self.prior, self.heldout_data.to(config.device))
+                    row["heldout"] = heldout_loss(self.prior, self.heldout_data.to(self.device))
                 self.evaluations.append({"step": self.step, "heldout": row["heldout"]})
             if self.step % config.logger.log_every == 0 or row:
                 row |= {"step": self.step, "loss": sum(running) / len(running), "gradient_norm": norm}
@@ -224,7 +226,7 @@ class Pretrainer:
 
     def _update(self) -> tuple[float, float]:
         config = self.config
-        total = torch.zeros((), device=config.device)
+        total = torch.zeros((), device=self.device)
         for part in range(config.optimizer.compute.accumulate):
             generator = derived_generator(
                 config.seed, self.step, self.processes.rank * config.optimizer.compute.accumulate + part
@@ -256,7 +258,7 @@ class Pretrainer:
         """The loss of ``count`` scenes, each with one of its prompts, or without a prompt if it is withheld."""
         reads = self.prior.conditional
         scenes, prompts = self.data.draw(count, generator, prompts=reads)
-        x0 = scenes.to(self.config.device)
+        x0 = scenes.to(self.device)
         if not reads:
             return self.prior.pretraining_loss(x0, generator)
         choice = torch.rand(2, count, generator=generator).tolist()

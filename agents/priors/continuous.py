@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -109,7 +110,7 @@ class ContinuousPrior(ScenePrior):
         """Leading features of the continuous output that are poses."""
         return self.code.pose_width
 
-    @property
+    @cached_property
     def is_constant(self) -> Tensor:
         """(D,) bool: features that never vary."""
         return self.code.normalizer.is_constant

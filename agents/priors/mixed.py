@@ -39,7 +39,7 @@ from agents.priors.prior import (
 from scene_envs.datasets.prompts.facts import SIDES
 from scene_envs.datasets.prompts.parser import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.normalizer import Normalizer
+from scene_envs.normalizer import Normalizer, constant_on
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type, members_of
@@ -223,7 +223,7 @@ class MixedPrior(ScenePrior):
         """K = C + 1."""
         return self.config.network.categories
 
-    @property
+    @cached_property
     def is_constant(self) -> Tensor:
         """(D,) bool: features of the pose that never vary."""
         constant = self.normalizer.is_constant.clone()
@@ -287,7 +287,7 @@ class MixedPrior(ScenePrior):
         already. If the chain only absorbs, the category that a slot holds already is not barred in this slot.
         """
         barred = torch.zeros(*state.shape, self.num_categories, dtype=torch.bool, device=state.device)
-        barred[:, len(self.scene_type.fixed) :, list(self.scene_type.fixed_categories)] = True
+        barred[:, len(self.scene_type.fixed) :] = constant_on(self._fixed_kinds, state.device)
         if closed is not None:
             barred |= closed[:, None]
         if self.categories.only_absorbs:
@@ -303,6 +303,11 @@ class MixedPrior(ScenePrior):
         return self.config.union == "one_type" and len(self._members) > 1 and self.categories.only_absorbs
 
     @cached_property
+    def _fixed_kinds(self) -> Tensor:
+        """(K,) bool: categories of fixed objects."""
+        return torch.isin(torch.arange(self.num_categories), torch.tensor(self.scene_type.fixed_categories))
+
+    @cached_property
     def _members(self) -> Tensor:
         """(M, C) bool: assets of each member of a union of scene types; one row for any other type."""
         assets = self.scene_type.assets
@@ -310,7 +315,7 @@ class MixedPrior(ScenePrior):
 
     def _fitting_assets(self, present: Tensor) -> Tensor:
         """(B, C) bool: assets of the members that have all of ``present`` (B, C) bool; all if no member has them."""
-        members = self._members.to(present.device)
+        members = constant_on(self._members, present.device)
         fits = ~(present[:, None] & ~members).any(dim=-1)  # (B, M)
         allowed = (fits[..., None] & members).any(dim=1)
         return allowed | ~fits.any(dim=-1, keepdim=True)

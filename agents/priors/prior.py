@@ -6,6 +6,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -25,7 +26,7 @@ from agents.priors.guidance import Guide, Hook, Watch, guidance_hook, physics_st
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.envs.settings import check_claim_guidance, check_guidance, check_physics_guidance
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.normalizer import Normalizer
+from scene_envs.normalizer import Normalizer, constant_on
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
@@ -290,14 +291,14 @@ class ScenePrior(nn.Module, ABC):
         """Leading features of the continuous output that are poses; the others, if any, are categories."""
         return POSE_FEATURES
 
-    @property
+    @cached_property
     def is_constant(self) -> Tensor:
         """(D,) bool: features that never vary."""
         return self.normalizer.is_constant
 
     def known(self, slots: int) -> Tensor:
         """(slots, D) bool: entries that are clamped (fixed welded slots, constant features)."""
-        known = self.is_constant.to(self._fixed.device).expand(slots, -1).clone()
+        known = constant_on(self.is_constant, self._fixed.device).expand(slots, -1).clone()
         known[: len(self.scene_type.fixed)] = True
         return known
 

@@ -70,7 +70,7 @@ def blamed_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Generat
 
 def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
     """A random half of the free objects (rounded up), and all empty slots."""
-    free = torch.nonzero(scene.is_free[0]).flatten().numpy()
+    free = torch.nonzero(scene.is_free[0]).flatten().cpu().numpy()
     chosen = rng.choice(free, size=(len(free) + 1) // 2, replace=False)
     mask = scene.is_empty[0].clone()
     mask[torch.from_numpy(chosen)] = True
@@ -137,7 +137,8 @@ class RegionMask:
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         """(N,) bool, True where a slot is regenerated."""
         place = scene.translations[0]
-        inside = ((place >= torch.tensor(self.low)) & (place <= torch.tensor(self.high))).all(dim=-1)
+        low, high = (torch.tensor(corner, device=place.device) for corner in (self.low, self.high))
+        inside = ((place >= low) & (place <= high)).all(dim=-1)
         return (inside & scene.is_free[0]) | _some(scene.is_empty[0], self.empty, rng)
 
 

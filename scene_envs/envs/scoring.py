@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from typing import Any, cast
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scene_envs.arrays import resolve_device
 from scene_envs.envs.settings import PROMPT_SOURCES, check_guidance
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.protocols import PriorLike, PromptedPriorLike, SceneScorer
@@ -34,11 +36,24 @@ def resolve_reward(reward: Any) -> SceneScorer:
     return _resolver("reward")(reward)
 
 
-def resolve_prior(prior: Any) -> PriorLike:
-    """A prior from a name or a path; any other value is returned unchanged. Raises UnknownNameError for no shipped
-    prior of that name, and MissingDependencyError where no installed package resolves priors.
+def resolve_prior(prior: Any, device: str = "auto") -> PriorLike:
+    """A prior from a name or a path, on ``device`` (:func:`~scene_envs.arrays.resolve_device`). One that is given stays
+    where it is with ``"auto"``; on another device, a copy is returned. Raises UnknownNameError for no shipped prior of
+    that name, and MissingDependencyError where no installed package resolves priors.
     """
-    return _resolver("prior")(prior) if isinstance(prior, str) else prior
+    if isinstance(prior, str):
+        loaded = _resolver("prior")(prior)
+        return loaded.to(resolve_device(device)) if hasattr(loaded, "to") else loaded
+    if device == "auto" or not hasattr(prior, "to"):
+        return prior  # type: ignore[no-any-return]
+    target = torch.empty(0, device=resolve_device(device)).device
+    return prior if prior_device(prior) == target else deepcopy(prior).to(target)  # type: ignore[no-any-return]
+
+
+def prior_device(prior: PriorLike) -> torch.device:
+    """Device of the prior's weights; CPU for a prior without weights."""
+    parameters: Iterable[Tensor] = prior.parameters() if hasattr(prior, "parameters") else ()
+    return next((p.device for p in parameters), torch.device("cpu"))
 
 
 @cache
@@ -70,10 +85,6 @@ class Score:
     per_object: Tensor | None = None
     object_flags: Mapping[str, Tensor] = field(default_factory=dict)
 
-    def to(self, device: torch.device) -> Score:
-        """The same verdict on another torch device."""
-        return self._each(lambda values: values.to(device))
-
     def row(self, index: int) -> Score:
         """The verdict on one scene, as a batch of one."""
         return self._each(lambda values: values[index : index + 1])
@@ -89,8 +100,8 @@ class Score:
 
 
 class RewardScorer:
-    """Scorer of batches of scenes on the CPU; its reward, a name, mapping, function or object, is resolved once. The
-    ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
+    """Scorer of batches of scenes, on their device; its reward, a name, mapping, function or object, is resolved once.
+    The ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
     ``physics`` names the engine.
 
     >>> scorer = RewardScorer("object_count")

@@ -107,6 +107,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | processes for physics in the objective; 0: in the calling process; `"ray"`: on a Ray cluster |
     | `physics` | `"auto"` | engine of motion: `bullet`, `mujoco`, `warp`; `auto`: Bullet if installed, else MuJoCo |
+    | `device` | `"auto"` | device of the network: `cpu`, `cuda`; `auto`: of a given prior, else the GPU if any |
     | `render_mode` | `None` | `"rgb_array"`: pictures, masked objects in red; `"human"`: a page in the browser |
     | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
     | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |
@@ -415,6 +416,7 @@ class SearchMaskEnv(SearchEnv):
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | processes for physics in the objective; 0: in the calling process; `"ray"`: on a Ray cluster |
     | `physics` | `"auto"` | engine of motion: `bullet`, `mujoco`, `warp`; `auto`: Bullet if installed, else MuJoCo |
+    | `device` | `"auto"` | device of the network: `cpu`, `cuda`; `auto`: of a given prior, else the GPU if any |
     | `render_mode` | `None` | `"rgb_array"`: pictures, masked objects in red; `"human"`: a page in the browser |
     | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
     | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |

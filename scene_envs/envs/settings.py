@@ -40,6 +40,8 @@ class EnvSettings:
         workers: Number of physics worker processes; 0 computes in this process, ``"ray"`` on a Ray cluster.
         physics: Engine that computes motion: ``bullet``, ``mujoco`` or ``warp``; ``auto`` takes Bullet where it is
             installed, else MuJoCo.
+        device: Torch device of the network and of tensors, such as ``cpu`` or ``cuda``; ``auto`` is that of a prior
+            that is given, and for a name the GPU where torch finds one, else the CPU.
         prompt: Description of the wanted scenes, for priors that read prompts; None for none.
         guidance: Weight of classifier-free guidance in the prior's own steps; needs a prompt.
 
@@ -53,6 +55,7 @@ class EnvSettings:
     slots: int | None = None
     workers: int | str = 0
     physics: str = "auto"
+    device: str = "auto"
     prompt: Any = None
     guidance: float = 0.0
 

@@ -209,7 +209,7 @@ def test_prompts_of_the_grammar_are_true_english(reader):
 
 
 def test_prompts_go_to_json_and_back(reader, monkeypatch):
-    monkeypatch.setattr(env_spaces, "resolve_prior", lambda name: reader)
+    monkeypatch.setattr(env_spaces, "resolve_prior", lambda name, device: reader)
     env = gym.make(ID, num_steps=2, prior="mine", prompt=PROMPTS, guidance=1.0, action_mode="noise")
     spec = gym.envs.registration.EnvSpec.from_json(env.spec.to_json())
     assert json.loads(env.spec.to_json())["kwargs"]["prompt"] == PROMPTS

@@ -276,7 +276,7 @@ def test_fingerprints_are_of_the_set_of_objects(env):
 
 
 def test_spec_goes_to_json_and_actions_are_checked(env, prior, free_objects, monkeypatch):
-    monkeypatch.setattr("scene_envs.envs.spaces.resolve_prior", lambda name: prior)
+    monkeypatch.setattr("scene_envs.envs.spaces.resolve_prior", lambda name, device: prior)
     made = gym.make(ID, objective="object_count", branching=2, num_steps=2)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(made.spec.to_json()))
     assert data_equivalence(made.reset(seed=1), again.reset(seed=1), exact=True)
@@ -490,7 +490,7 @@ def test_planners_search_it(mask_env: SearchMaskEnv, planner: type, tmp_path: An
 def test_the_spec_goes_to_json_and_bad_masks_are_named(
     mask_kwargs: dict[str, Any], prior: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("scene_envs.envs.spaces.resolve_prior", lambda name: prior)
+    monkeypatch.setattr("scene_envs.envs.spaces.resolve_prior", lambda name, device: prior)
     masks = ["random", {"name": "empty", "count": 3}]
     made = gym.make(MASK_ID, objective="object_count", masks=masks, num_steps=2)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(made.spec.to_json()))

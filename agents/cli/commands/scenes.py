@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
+from scene_envs.arrays import resolve_device
 from scene_envs.errors import InvalidInputError
 from scene_envs.files import is_file
 
@@ -29,7 +30,7 @@ def load_prior(settings: Any) -> ScenePrior:
     """The prior that the keys ``prior`` and ``device`` name."""
     from agents.priors.prior import ScenePrior
 
-    return ScenePrior.load(settings.prior).to(settings.device)
+    return ScenePrior.load(settings.prior).to(resolve_device(settings.device))
 
 
 def draw(prior: ScenePrior, settings: DrawKeys, count: int, **keys: Any) -> SceneBatch:

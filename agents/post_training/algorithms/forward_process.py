@@ -356,7 +356,7 @@ class ForwardProcess(AveragedSampler):
 
         With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
         """
-        x0 = self.prior.encode(finished_scenes(batch).to(self.prior.device))
+        x0 = self.prior.encode(finished_scenes(batch))
         scenes = batch.exclude("next", "timestep")[:, -1].set("scene", x0)
         size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
         valid = max(1.0, processes.sum_numbers(int(scenes["valid"].sum()))[0])
