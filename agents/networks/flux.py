@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from agents.networks.denoisers import products_in
 from agents.networks.flux_modules import (
     CountConditioningConfig,
     CountEmbeddingConfig,
@@ -256,6 +257,7 @@ class FluxDenoiser(nn.Module):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         self.fourier = FourierFeatures(config.frequencies)
+        self.body_precision = "float32"
 
     def forward(self, x: Tensor, position: Tensor, noise_level: Tensor) -> Tensor:
         """Predict.
@@ -268,8 +270,10 @@ class FluxDenoiser(nn.Module):
         features = torch.cat([x, self.fourier(position, noise_level[:, None])], dim=-1)
         condition = F.silu(self.time_in(timestep_embedding(250.0 * noise_level.log(), 128)))
         tokens = self.scene_in(features)
-        for block in self.blocks:
-            tokens = block(tokens, condition)
+        with products_in(self.body_precision, tokens):
+            for block in self.blocks:
+                tokens = block(tokens, condition)
+        tokens = tokens.to(features.dtype)
         shift, scale = self.final_modulation(condition).unsqueeze(1).chunk(2, dim=-1)
         return self.out((1 + scale) * F.layer_norm(tokens, (self.config.hidden,), eps=1e-6) + shift)
 
@@ -412,7 +416,8 @@ _TIME_WIDTH = 256
 class MixedFlux(nn.Module):
     """Poses (B, N, 12) and category states (B, N) to a pose output (B, N, 12) and logits (B, N, K).
 
-    Permutation-equivariant in the slots. Padding of the text is masked, so it changes nothing.
+    Permutation-equivariant in the slots. Padding of the text is masked, so it changes nothing. The products of the
+    blocks are in ``body_precision``, which denoisers set at every step of a chain.
 
     >>> network = MixedFlux(MixedFluxConfig(categories=8, hidden=32, heads=2, text_width=16))
     >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
@@ -451,6 +456,7 @@ class MixedFlux(nn.Module):
         )
         self.logits_out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, config.categories))
         self._build_modules("output")
+        self.body_precision = "float32"
         for layer in (self.final_modulation, self.pose_out[-1], self.logits_out[-1]):
             for parameter in layer.parameters():
                 nn.init.zeros_(parameter)
@@ -520,7 +526,14 @@ class MixedFlux(nn.Module):
         self, slots: Tensor, words: Tensor | None, condition: Tensor, text_mask: Tensor | None,
         biases: Tensor | None, scene: Scene,
     ) -> Tensor:  # fmt: skip
-        """Slots (B, N, H) and words (B, L, H) through all blocks to slots (B, N, H)."""
+        """Slots (B, N, H) and words (B, L, H) through all blocks to slots (B, N, H), in ``body_precision``."""
+        with products_in(self.body_precision, slots):
+            return self._blocks(slots, words, condition, text_mask, biases, scene).to(slots.dtype)
+
+    def _blocks(
+        self, slots: Tensor, words: Tensor | None, condition: Tensor, text_mask: Tensor | None,
+        biases: Tensor | None, scene: Scene,
+    ) -> Tensor:  # fmt: skip
         if biases is not None and scene.slot_mask is not None:  # once for all blocks
             biases = biases.masked_fill_(~scene.slot_mask[:, None, None], -torch.inf)
         chosen: Iterator[Tensor | None] = itertools.repeat(None) if biases is None else iter(biases)

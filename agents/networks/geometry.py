@@ -29,14 +29,15 @@ from torch.nn import functional as F
 
 from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
 from scene_envs.errors import unknown_name
-from scene_envs.rotations import project_to_so3
+from scene_envs.normalizer import constant_on
+from scene_envs.rotations import quaternion_to_matrix
 
 # -- rotations ------------------------------------------------------------------------------------
 
 
 ROTATION_FEATURES = 9 + 4
 """Numbers per rotation."""
-_TILTS = (6, 7, 2, 5)
+_TILTS = torch.tensor([6, 7, 2, 5])
 """Entries R_20, R_21, R_02 and R_12 of a row-major matrix."""
 _MIN_ROTATION_NOISE = 1e-4
 _TILT_REACH = 4.0
@@ -85,15 +86,37 @@ class RotationFeatures(FluxModule):
         if turns is None:
             return None
         off, tilt = (turns * self.gates(features)).split([9, 4], dim=-1)
-        return F.pad(off.index_add(-1, torch.tensor(_TILTS, device=off.device), tilt), (3, 0))
+        return F.pad(off.index_add(-1, constant_on(_TILTS, off.device), tilt), (3, 0))
+
+
+_SQUARINGS = 12
+"""Squarings of the matrix of a quaternion, whose largest eigenvalue is then the only one that is left."""
 
 
 @torch.no_grad()
 def nearest_rotations(rotation: Tensor) -> Tensor:
-    """The rotations that are nearest to noisy matrices (B, N, 3, 3); the identity where all entries are NaN."""
+    """The rotations that are nearest to noisy matrices (B, N, 3, 3); the identity where all entries are NaN.
+
+    The quaternion is the eigenvector of the largest eigenvalue of a symmetric matrix (Davenport; Horn 1987, section 4).
+    Squaring the matrix again and again finds it with products alone, which a GPU can capture; an SVD is none.
+    """
     with torch.autocast(rotation.device.type, enabled=False):
-        wide = rotation if rotation.dtype == torch.float64 else rotation.float()
-        return project_to_so3(wide.nan_to_num())
+        wide = rotation.nan_to_num().double()
+        xx, xy, xz, yx, yy, yz, zx, zy, zz = wide.flatten(-2).unbind(-1)
+        entries = [
+            xx + yy + zz, zy - yz, xz - zx, yx - xy, zy - yz, xx - yy - zz, xy + yx, xz + zx,
+            xz - zx, xy + yx, yy - xx - zz, yz + zy, yx - xy, xz + zx, yz + zy, zz - xx - yy,
+        ]  # fmt: skip
+        square = torch.stack(entries, dim=-1).unflatten(-1, (4, 4)).flatten(0, -3)
+        square = square / (2.0 * torch.linalg.matrix_norm(wide).flatten()[:, None, None] + 1e-9)
+        square.diagonal(dim1=-2, dim2=-1).add_(0.9)  # positive
+        square[:, 0, 0] += 1e-14
+        for _ in range(_SQUARINGS):
+            square = square @ square
+            square = square / square.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[:, None, None]
+        best = square.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+        quaternion = square.gather(-1, best[:, None, None].expand(-1, 4, 1)).view(*wide.shape[:-2], 4)
+        return quaternion_to_matrix(quaternion).to(rotation if rotation.dtype == torch.float64 else torch.float32)
 
 
 @torch.no_grad()
@@ -116,7 +139,7 @@ def rotation_features(rotation: Tensor, nearest: Tensor, noise: Tensor) -> Tenso
     """
     level = noise.to(nearest).clamp(min=_MIN_ROTATION_NOISE)[..., None]
     off = (rotation.to(nearest) - nearest).flatten(-2) / level
-    tilt = nearest.flatten(-2)[..., list(_TILTS)]
+    tilt = nearest.flatten(-2).index_select(-1, constant_on(_TILTS, nearest.device))
     return torch.cat([off, tilt / (level.square() + (tilt / _TILT_REACH).square()).sqrt()], dim=-1)
 
 

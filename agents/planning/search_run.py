@@ -126,7 +126,9 @@ def _search(
     progress: Progress | None,
 ) -> SearchOutcome:
     """:func:`run_search` with its settings resolved, in a folder that no other process writes into."""
-    loaded = resolve_prior(prior, config.device)
+    loaded: Any = resolve_prior(prior, config.device)
+    if config.precision != "float32":
+        loaded = loaded.with_precision(config.precision)
     fixed = {key: value for key, value in named.items() if key not in _LIMITS} | {"prior": loaded}
     if starts is not None:
         if starts.scene_type.name != loaded.scene_type.name:

@@ -16,7 +16,7 @@ from torch import Generator, Tensor, nn
 from agents.configuration.prior_names import joint_name, split_name
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, ReverseStep, StepTable
 from agents.diffusion.gaussian import check_weighting, make_schedule, timestep_distribution, timestep_weights
-from agents.networks.denoisers import Observed
+from agents.networks.denoisers import Observed, check_precision
 from agents.networks.flux_modules import CountConditioning
 from agents.networks.registry import config_state
 from agents.networks.text import Text
@@ -377,6 +377,26 @@ class ScenePrior(nn.Module, ABC):
         """
         strength = physics_strength(strength, self.config, self.scene_type)
         self.config = replace(self.config, physics_guidance=strength)
+        return self
+
+    def with_precision(self: Prior, precision: str) -> Prior:
+        """This prior, whose chains compute the products of the network's blocks in ``precision``.
+
+        One of ``"float32"``, ``"tf32"`` and ``"bfloat16"``. Positions, relations, contacts, all that enters and leaves
+        the blocks, and the steps whose noise-to-signal ratio is at most 0.1 are always in float32. Training is not
+        changed.
+
+        Raises:
+            UnknownNameError: another word.
+            InvalidInputError: the device of the prior has no such products, or its network no such blocks.
+        """
+        check_precision(precision, self.device)
+        if precision != "float32" and not hasattr(self.denoiser.network, "body_precision"):
+            raise InvalidInputError(
+                f"precision={precision!r}: {type(self.denoiser.network).__name__} has no body_precision, which tells a "
+                "network the precision of its blocks; use precision=float32"
+            )
+        self.denoiser.chain_precision = precision
         return self
 
     def with_open_empty(self: Prior, share: float) -> Prior:
