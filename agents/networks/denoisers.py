@@ -135,11 +135,11 @@ class Replays:
 
     def _captured(self, network: nn.Module, inputs: Sequence[Tensor], named: dict[str, Tensor | None]) -> Any:
         """Inputs, replay and outputs of a captured call; None if it cannot be captured."""
-        if self._pool is None and self._on == "cuda":
-            self._pool = torch.cuda.graph_pool_handle()
         own = [value.clone() for value in inputs]
         others = {name: None if value is None else value.clone() for name, value in named.items()}
         try:
+            if self._pool is None and self._on == "cuda":
+                self._pool = torch.cuda.graph_pool_handle()  # one memory for all graphs: no two run at once
             replay, outputs = self._capture(lambda: network(*own, **others), self._pool)
         except Exception as error:  # what an operation raises during a capture is up to it
             self._fails, name = True, type(network).__name__
