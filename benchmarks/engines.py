@@ -76,7 +76,7 @@ from scipy.spatial.transform import Rotation
 from scene_envs.assets.base import Asset
 from scene_envs.export import PlacedScene, export, place
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import EngineName, feasibility
+from scene_envs.physics import feasibility
 from scene_envs.physics.parts import FRICTION
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import list_scene_types
@@ -134,7 +134,7 @@ Engine = Callable[[SceneBatch], Verdicts]
 """Verdicts on all slots of some scenes of one type."""
 
 
-def product_verdicts(batch: SceneBatch, physics: EngineName) -> Verdicts:
+def product_verdicts(batch: SceneBatch, physics: str) -> Verdicts:
     """The verdicts of an engine of this package."""
     result = feasibility(batch, physics=physics)
     found = (getattr(result, name).double().numpy() for name in ("depth", "displacement", "rotation"))

@@ -23,7 +23,7 @@ from rich.table import Table
 from tensordict import TensorDict
 from torch import Tensor
 
-from agents.diffusion.reverse_steps import gaussian_log_prob
+from agents.diffusion.reverse_steps import GaussianStep, gaussian_log_prob
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
 from agents.post_training.policy import gradient_weights
 from agents.priors.prior import ScenePrior
@@ -116,7 +116,9 @@ def through_chain(prior: ScenePrior, steps: int, batch: int) -> Callable[[], Non
     def run() -> None:
         x, total = prior.initial(batch, prior.config.slots, torch.Generator().manual_seed(0)), torch.zeros(())
         for step in range(steps):
-            mean, std = policy.distribution(x, step)
+            reverse = policy.distribution(x, step)
+            assert isinstance(reverse, GaussianStep), "the prior is continuous"
+            mean, std = reverse.mean, reverse.std
             action = mean + std * torch.randn_like(mean)
             if step < steps - 1:
                 total = total - (advantage * gaussian_log_prob(action.detach(), mean, std).sum(dim=1)).mean()

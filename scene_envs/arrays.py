@@ -1,8 +1,10 @@
-"""Types of numpy arrays, ranges of their rows, and devices by name. The module does not import torch."""
+"""Types of numpy arrays, ranges of their rows, devices by name, and work in their memory; torch is not imported."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Result = TypeVar("Result")
 
 
 def ranges(first: Index, counts: Index) -> tuple[Index, Index]:
@@ -58,3 +61,26 @@ def resolve_device(name: str | torch.device, auto: torch.device | None = None) -
         found = "" if count else "; torch finds no CUDA GPU"
         raise InvalidInputError(f"device={str(name)[:60]!r} is no device of this machine; use one of {here}{found}")
     return device
+
+
+def within_memory(work: Callable[[int], Result], size: int, key: str) -> Result:
+    """``work(size)``, where ``size`` scenes are computed at once, as ``key`` says.
+
+    Raises:
+        InvalidInputError: the memory is too small; the message gives the largest half, quarter, ... of ``size`` with
+            which ``work`` ends.
+    """
+    reason, fits = "", size
+    while fits:
+        try:
+            found = work(fits)
+            break
+        except (MemoryError, RuntimeError) as error:
+            reason = reason or (str(error).splitlines() or [type(error).__name__])[0][:200]
+            if not (isinstance(error, MemoryError) or re.search("out of memory|can't allocate memory", str(error))):
+                raise
+        fits //= 2  # out of the clause above, which holds the tensors of the attempt
+    if fits == size:
+        return found
+    advice = f"{key}={fits} fits" if fits else "not even one fits"
+    raise InvalidInputError(f"{key}={size} needs more memory than the device has ({reason}); {advice}")

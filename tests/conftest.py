@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import sys
 from collections.abc import Iterator
 from functools import partialmethod
@@ -35,6 +36,16 @@ def pytest_collection_finish() -> None:
         return low.clone(), high.clone(), tilted
 
     ranges._ranges = once
+
+
+@pytest.fixture(autouse=True)
+def _usual_logging() -> None:
+    """Warnings reach the tests that read them, whatever a library of an earlier test set for all loggers."""
+    logging.root.setLevel(logging.WARNING)
+    logging.disable(logging.NOTSET)
+    for name, logger in logging.root.manager.loggerDict.items():
+        if name.startswith(("scene_envs", "rewards", "agents")) and isinstance(logger, logging.Logger):
+            logger.disabled, logger.propagate = False, True
 
 
 @pytest.fixture(autouse=True)

@@ -6,6 +6,7 @@ traceback only under ``--traceback`` or ``SCENE_ENVS_TRACEBACK=1``.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import dataclasses
 import errno
@@ -65,6 +66,11 @@ scene-envs COMMAND --help lists the keys of a command; --traceback shows where a
 --allow-local allows reward=./my_rewards.py:clutter to run that file without a question.
 A command writes into output=FOLDER, by default runs/COMMAND-TIME.
 """
+_FLAGS = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+for _names in (["--config-dir"], ["--config"], ["--cfg", "-c"]):
+    _FLAGS.add_argument(*_names, default="")
+for _names in (["--allow-local"], ["--multirun", "-m"], ["--help", "-h"]):
+    _FLAGS.add_argument(*_names, action="store_true")
 _MINIMA = {
     "count": 1,
     "num_steps": 1,
@@ -88,30 +94,22 @@ _GRAMMAR = "grammar"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status.
-
-    Args:
-        argv: the words after ``scene-envs``; those of the process by default.
-    """
-    return _guarded(list(sys.argv[1:] if argv is None else argv), _dispatch)
+    """Run one command and return its exit status; ``argv`` replaces the words of the process after ``scene-envs``."""
+    return _guarded(argv, _dispatch)
 
 
 def main_of(command: str, meaning: str, module: ModuleType, argv: Sequence[str] | None = None) -> int:
     """Run a program that consists of one command, and return its exit status.
 
-    Args:
-        command: its name in messages and in the name of its folder.
-        meaning: what it does, in one phrase.
-        module: has ``run(settings, run)``, as a module of :mod:`agents.cli.commands`.
-        argv: the words after the program; those of the process by default.
+    ``command`` is its name in messages and in the name of its folder, ``meaning`` what it does, in one phrase, and
+    ``module`` has ``run(settings, run)``, as those of :mod:`agents.cli.commands`.
     """
-    return _guarded(
-        list(sys.argv[1:] if argv is None else argv), lambda words: _run_or_help(command, meaning, module, words)
-    )
+    return _guarded(argv, lambda words: _run_or_help(command, meaning, module, words))
 
 
-def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
+def _guarded(argv: Sequence[str] | None, work: Callable[[list[str]], int]) -> int:
     """The exit status of ``work``, whose errors become one paragraph on stderr."""
+    words = list(sys.argv[1:] if argv is None else argv)
     show_traceback = os.environ.get("SCENE_ENVS_TRACEBACK", "") not in ("", "0")
     if "--traceback" in words:
         show_traceback = True
@@ -128,10 +126,6 @@ def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as in `scene-envs rewards | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
-    except RecursionError as error:
-        if show_traceback:
-            traceback.print_exc()
-        return _complain(f"a value or a file is nested too deeply ({_cut(error)}); write it flatter", WRONG_INPUT)
     except Exception as error:
         if show_traceback:
             traceback.print_exc()
@@ -154,10 +148,8 @@ def _ended(status: int) -> int:
 
 
 def entry_point() -> None:
-    """Run as a program, in which idle threads of OpenMP sleep after a short wait unless the environment says otherwise.
-
-    By default idle threads wait busily. Where other work shares the cores, they take processor time away from the
-    threads for which they wait.
+    """Run as a program, in which idle threads of OpenMP sleep after a short wait unless the environment says otherwise:
+    threads that wait busily take processor time from those for which they wait, where other work shares the cores.
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)  # read when torch loads OpenMP
@@ -178,16 +170,19 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str]) -> int:
-    words = list(words)
-    config_dir, file = _option(words, "--config-dir"), _option(words, "--config")
-    allow_local = _flag(words, "--allow-local")
-    shown, sweep, asked = _option(words, "--cfg", "-c"), _flag(words, "--multirun", "-m"), _flag(words, "-h", "--help")
+    try:
+        flags, words = _FLAGS.parse_known_args(words)
+    except argparse.ArgumentError as error:
+        name = str(error.argument_name).partition("/")[0]
+        wrong = "takes no value" if "explicit" in error.message else f"needs a value behind it, as in {name} VALUE"
+        raise InvalidInputError(f"{name} {wrong}") from None
+    config_dir, file, shown, sweep = flags.config_dir, flags.config, flags.cfg, flags.multirun
     if shown not in ("", "job"):
         raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
     command = program.removeprefix("scene-envs ")
     named = _named(words, getattr(module, "POSITIONAL", ()))
     keys = keys_of(module)
-    if asked:
+    if flags.help:
         config = keys if sweep or not named else compose(command, keys, named, config_dir, file)
         print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
         return DONE
@@ -196,7 +191,7 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
     variants = expand_sweeps(named) if sweep else [(named, "")]
     runs = [(compose(command, keys, variant, config_dir, file), label) for variant, label in variants]
     for settings, _ in runs if not shown else ():
-        _check(settings, module, allow_local)
+        _check(settings, module, flags.allow_local)
     folder = ""
     for settings, label in runs:
         if sweep:  # each run has a folder of its own below ``output``
@@ -233,29 +228,6 @@ def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> No
             module.run(settings, run)
 
 
-def _option(words: list[str], *names: str) -> str:
-    """The value of ``--name VALUE`` or ``--name=VALUE``, taken out of the words; empty where it is not given."""
-    for position, word in enumerate(words):
-        name, equals, value = word.partition("=")
-        if name not in names:
-            continue
-        del words[position]
-        if not equals:
-            if position == len(words):
-                raise InvalidInputError(f"{name} needs a value behind it, as in {name} VALUE")
-            value = words.pop(position)
-        return value
-    return ""
-
-
-def _flag(words: list[str], *names: str) -> bool:
-    """Whether a flag is among the words; takes it out."""
-    found = [word for word in words if word in names]
-    for word in found:
-        words.remove(word)
-    return bool(found)
-
-
 def _named(words: Sequence[str], keys: Sequence[str]) -> list[str]:
     """The words; each one without ``=`` gets the next of ``keys`` in front, and stays as it is when none is left."""
     left = iter(keys)
@@ -266,6 +238,8 @@ def _verdict(error: Exception) -> tuple[str, int]:
     """The message for the user, and the exit status."""
     if isinstance(error, InvalidInputError | UnknownNameError | CorruptFileError):
         return str(error), WRONG_INPUT
+    if isinstance(error, RecursionError):
+        return f"a value or a file is nested too deeply ({_cut(error)}); write it flatter", WRONG_INPUT
     if isinstance(error, SceneEnvsError):
         return str(error), FAILED
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):

@@ -38,10 +38,7 @@ def frechet_scene_distance(a: SceneBatch, b: SceneBatch, *, encoder: SetEncoder 
     Args:
         a: scenes.
         b: scenes of the same type, or of another one; categories are matched by asset name.
-        encoder: encoder of the features; None takes the shipped one.
-
-    Returns:
-        The distance, at least 0, in units of the encoder's whitened features.
+        encoder: encoder of the features; None takes the shipped one. The distance is in units of its whitened features.
 
     Raises:
         InvalidInputError: a batch has fewer than two scenes.
@@ -106,9 +103,6 @@ def frechet_inception_distance(
         width: width of the renders in pixels; they are then scaled to 299 x 299.
         height: height of the renders in pixels.
         batch_size: number of images per forward pass.
-
-    Returns:
-        The distance, at least 0.
 
     Raises:
         MissingDependencyError: torchvision is not installed.
@@ -210,25 +204,18 @@ def render_classifier_accuracy(
 ) -> Accuracy:
     """Accuracy, on held-out scenes, of a CNN trained to separate renders of real scenes from renders of samples.
 
-    The renders are semantic: one class per asset, seen by the camera of the scene type. The protocol is that of
-    :func:`~agents.evaluation.classifier.classifier_accuracy`. A render cannot show millimetres: at the default size a
-    pixel of a table is about 2 cm wide.
+    The renders are semantic: one class per asset, seen by the camera of the scene type. The protocol, the other
+    arguments and the errors are those of :func:`~agents.evaluation.classifier.classifier_accuracy`. A render cannot
+    show millimetres: at the default size a pixel of a table is about 2 cm wide.
 
     Args:
-        real: real scenes; the two batches should share none.
-        fake: samples of the same scene type. The larger batch is subsampled to the size of the smaller one.
+        real: real scenes.
+        fake: samples of the same scene type.
         seeds: number of repetitions with other splits and weights.
         seed: seed of the first repetition.
         width: width of the renders in pixels, at least 16.
         height: height of the renders in pixels, at least 16.
-        config: settings of the training and test.
-
-    Returns:
-        Accuracy as a fraction; 0.5 is chance.
-
-    Raises:
-        InvalidInputError: the scene types differ, a batch has fewer than 20 scenes, ``seeds`` is below 1, or a side of
-            the renders is below 16 pixels.
+        config: settings of the training.
     """
     check_same_assets(real, fake)
     if min(width, height) < 16:
@@ -242,7 +229,6 @@ def render_classifier_accuracy(
 
         return _RenderNetwork(colors), forward
 
-    config = config or ClassifierConfig()
     return two_sample_accuracy(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config)
 
 

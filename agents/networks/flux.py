@@ -669,5 +669,5 @@ def _mixed_sizes(keys: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-register_network("flux", "continuous", FluxConfig, FluxDenoiser, ratio="mlp_ratio", sizes=_continuous_sizes)
-register_network("flux", "mixed", MixedFluxConfig, MixedFlux, ratio="mlp_ratio", sizes=_mixed_sizes)
+register_network("flux", "continuous", FluxConfig, FluxDenoiser, sizes=_continuous_sizes)
+register_network("flux", "mixed", MixedFluxConfig, MixedFlux, sizes=_mixed_sizes)

@@ -18,10 +18,10 @@ from agents.post_training.settings import RegularisationSettings
 from agents.priors.prior import ScenePrior, asked_objects
 from agents.utils.process_group import ProcessGroup
 from scene_envs import __version__
-from scene_envs.errors import CorruptFileError, InvalidInputError, StorageError
-from scene_envs.files import cache_folder, read_tensors, trim_folder, write_tensors
+from scene_envs.errors import InvalidInputError, SceneEnvsError
+from scene_envs.files import cache_folder, trim_folder
 from scene_envs.progress import Progress
-from scene_envs.scene import POSE, POSE_FEATURES, SceneBatch
+from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
 _LOGGER = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ _WITHHELD = 0.1
 """Share of real scenes whose prompt is withheld, as in pretraining."""
 _AT_ONCE = 16
 """Number of scenes of the grammar between two updates of the progress; as many are compared with kept scenes."""
-_CACHE_SIZE = 256 * 2**20
+_CACHE_SIZE = 512 * 2**20
 """Bytes of the grammar's scenes that are kept for later runs."""
 
 
@@ -153,49 +153,29 @@ def _grammar_scenes(scene_type: SceneType, count: int, seed: int, progress: str)
     for file in sorted(Path(grammars.__path__[0]).glob("*.py")):
         key.update(file.read_bytes())
     path = cache_folder() / "real_scenes" / f"{scene_type.name}-{seed}-{count}-{key.hexdigest()[:16]}.safetensors"
-    if count > _AT_ONCE and (kept := _read_kept(path, parts[0], count)) is not None:
-        return kept
+    try:
+        kept = SceneBatch.load(path).tensor if path.exists() else None
+        if kept is not None and len(kept) == count and torch.equal(kept[: len(parts[0])], parts[0].tensor):
+            path.touch()  # those used last are kept longest
+            return SceneBatch(kept, scene_type)
+        reason = "" if kept is None else "the grammar draws others now"
+    except (SceneEnvsError, OSError) as error:
+        reason = str(error)
+    if reason:
+        _LOGGER.warning("the real scenes kept in %s are not taken and drawn anew: %s", path, reason)
     with Progress(title, count, style=progress) as shown:
         for first in range(_AT_ONCE, count, _AT_ONCE):
             parts.append(grammar.sample(rng, min(_AT_ONCE, count - first)))
             done = first + len(parts[-1])
             shown.update(done, "", f"{title} {done}/{count}")
     batch = SceneBatch.concatenate(parts)
-    if count > _AT_ONCE:
-        _write_kept(path, batch)
+    if len(parts) > 1:
+        try:
+            batch.save(path)
+            trim_folder(path.parent, _CACHE_SIZE)
+        except OSError as error:
+            _LOGGER.warning("real scenes could not be kept in %s: %s", path.parent, error)
     return batch
-
-
-def _read_kept(path: Path, begin: SceneBatch, count: int) -> SceneBatch | None:
-    """The ``count`` scenes in a file of the cache; None where there is none, it is damaged or does not begin so."""
-    try:
-        kept = read_tensors(path)[0]
-        scenes = begin.tensor.new_zeros(count, *begin.tensor.shape[1:])
-        scenes[..., -1] = 1.0
-        scenes[kept["present"], -1] = 0.0
-        scenes[kept["present"], POSE] = kept["poses"]
-        row, slot = kept["present"].nonzero(as_tuple=True)
-        scenes[row, slot, POSE_FEATURES + kept["categories"].long()] = 1.0
-        if not torch.equal(scenes[: len(begin)], begin.tensor):
-            raise ValueError("the grammar draws others now")
-        path.touch()  # those used last are kept longest
-    except FileNotFoundError:
-        return None
-    except (CorruptFileError, KeyError, IndexError, ValueError, RuntimeError, OSError) as error:
-        _LOGGER.warning("the real scenes kept in %s are not taken and drawn anew: %s", path, error)
-        return None
-    return SceneBatch(scenes, begin.scene_type)
-
-
-def _write_kept(path: Path, batch: SceneBatch) -> None:
-    """Keep scenes in the cache; a failure is only logged."""
-    present = ~batch.is_empty
-    poses, categories = batch.tensor[..., POSE][present], batch.categories[present].to(torch.int16)
-    try:
-        write_tensors(path, {"present": present, "poses": poses, "categories": categories})
-        trim_folder(path.parent, _CACHE_SIZE)
-    except (StorageError, OSError) as error:
-        _LOGGER.warning("real scenes could not be kept in %s: %s", path.parent, error)
 
 
 def kept_base_samples(

@@ -54,16 +54,9 @@ class SeededPolicy(TensorDictModuleBase):
     """A policy for one batch, whose noise follows from a seed: an episode gets the same, whichever process runs it.
 
     It reads and writes the keys of ``policy``, but for ``action_log_prob``. All episodes start at its first call. The
-    prompts are encoded once, at the first step.
-
-    Args:
-        policy: policy that draws the actions.
-        seed: seed of the run.
-        iteration: number of the batch in the run, from 0.
-        hook: change of the distributions, as :meth:`DenoisingPolicy.claim_hook` makes it.
-
-    Attributes:
-        text: tokens (B, L, W) and mask (B, L) that the network attends to; None when the prior reads no prompts.
+    prompts are encoded once, at the first step; ``text`` has their tokens (B, L, W) and mask (B, L), None for a prior
+    that reads none. ``seed`` is that of the run, ``iteration`` the number of the batch in it, from 0, and ``hook``
+    changes the distributions as :meth:`DenoisingPolicy.claim_hook` makes it.
     """
 
     def __init__(self, policy: DenoisingPolicy, seed: int, iteration: int = 0, hook: Hook | None = None) -> None:
@@ -235,15 +228,11 @@ class PromptDeck:
 
     def deal(self, count: int, generator: Generator) -> list[str]:
         """``count`` prompts; neighbours share a prompt, in groups of ``share`` or a few more."""
-        groups = max(1, count // self.share)
-        different = [self._text(index, generator) for index in self._indices(groups, generator)]
-        return [different[row * groups // count] for row in range(count)]
-
-    def _indices(self, groups: int, generator: Generator) -> list[int]:
-        """Indices of prompts, without repetition while there are enough."""
-        size = len(self._texts) or self._count
+        groups, size = max(1, count // self.share), len(self._texts) or self._count
         rounds = [torch.randperm(size, generator=generator) for _ in range(-(-groups // size))]
-        return torch.cat(rounds)[:groups].tolist()  # type: ignore[no-any-return]
+        indices = torch.cat(rounds)[:groups].tolist()  # without repetition while there are enough
+        different = [self._text(index, generator) for index in indices]
+        return [different[row * groups // count] for row in range(count)]
 
     def _text(self, index: int, generator: Generator) -> str:
         if self._texts or self._real is None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import csv
-import io
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -26,10 +25,10 @@ from agents.pretraining.settings import WEIGHT_DECAY, PretrainConfig
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import check_tensors, derived_generator, load_checkpoint, save_checkpoint
 from agents.utils.interrupts import Ending, finishing_steps
-from agents.utils.loggers import RunLogger, make_logger
+from agents.utils.loggers import RunLogger
 from agents.utils.process_group import ProcessGroup, is_first_process
-from agents.utils.weight_average import AveragedWeights, WeightAverage
-from scene_envs.arrays import resolve_device
+from agents.utils.weight_average import WeightAverage, averaged_weights
+from scene_envs.arrays import resolve_device, within_memory
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed, write_json, write_text
 from scene_envs.progress import Progress
@@ -46,45 +45,6 @@ _RESIDUAL = 512
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _RATE, _RISE = 3e-3, 0.2
 """Peak learning rate of the text warm-up, and the share of its steps in which it rises."""
-
-
-class TrainingLog:
-    """The file ``log.csv`` in ``directory``, each row written at once; the logger ``also`` gets the same rows."""
-
-    def __init__(self, directory: Path, also: RunLogger | None = None) -> None:
-        self.directory = directory
-        self.also = RunLogger() if also is None else also
-
-    def begin(self, step: int) -> None:
-        """Keep each row up to ``step`` once; remove rows beyond a checkpoint and, with ``step`` 0, of another run."""
-        path = self.directory / "log.csv"
-        if not path.exists():
-            return
-        with path.open(newline="", encoding="utf-8", errors="replace") as file:
-            rows = list(csv.DictReader(file))
-        # the last row of a killed run may lack some numbers
-        whole = [row for row in rows if str(row.get("step") or "").isdigit() and None not in map(row.get, FIELDS)]
-        kept = {int(row["step"]): row for row in whole if int(row["step"]) <= step}
-        if not kept:
-            path.unlink()
-            return
-        text = io.StringIO()
-        writer = csv.DictWriter(text, FIELDS, extrasaction="ignore")
-        writer.writeheader()
-        writer.writerows(kept[number] for number in sorted(kept))
-        write_text(path, text.getvalue())
-
-    def write(self, row: dict[str, float]) -> None:
-        """Write one row."""
-        logger.debug("%s", "  ".join(f"{key} {value:.6g}" for key, value in row.items()))
-        path = self.directory / "log.csv"
-        fresh = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, FIELDS)
-            if fresh:
-                writer.writeheader()
-            writer.writerow(row)
-        self.also.log({key: value for key, value in row.items() if key != "step"}, int(row["step"]))
 
 
 def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> None:
@@ -141,15 +101,16 @@ class Pretrainer:
         self.schedule = self._schedule()
         self.seconds = 0.0
         self.directory = config.directory
+        self.checkpoint_path = self.directory / "checkpoint.pt"
         chosen = config.logger.name if self.processes.is_first else "csv"
-        self.log = TrainingLog(self.directory, make_logger(chosen, self.directory))
-        self.evaluations: list[dict[str, float]] = []
+        self.logger = RunLogger(chosen, self.directory)
+        self.history: list[dict[str, float]] = []  # the rows of log.csv
         self._origin = _origin(config.prior, prior.card)
 
     @property
-    def checkpoint_path(self) -> Path:
-        """File of the resumable state."""
-        return self.directory / "checkpoint.pt"
+    def evaluations(self) -> list[dict[str, float]]:
+        """Losses on held-out scenes, each with its step."""
+        return [{"step": row["step"], "heldout": row["heldout"]} for row in self.history if "heldout" in row]
 
     def run(self) -> ScenePrior:
         """Train to ``config.iterations`` and return the averaged prior; writes it to ``output/prior``."""
@@ -161,13 +122,19 @@ class Pretrainer:
         if self.config.optimizer.compute.compile:
             self.prior.denoiser.network.compile()
         if self.processes.is_first:
-            self.log.begin(self.step)
-        with finishing_steps() as end, self._progress() as progress:
+            (self.directory / "log.csv").unlink(missing_ok=True)  # it may hold rows beyond the checkpoint
+            if self.history:
+                self._write_rows(self.history)
+        shown = self.config.progress if self.processes.is_first else "none"
+        bar = Progress("pretraining", self.config.iterations, done=self.step, style=shown)
+        with finishing_steps() as end, bar as progress:
             for row in self._steps(end):
                 if self.processes.is_first:
                     self._show(progress, row)
-                    self.log.write(row)
-        self.log.also.close()
+                    self._write_rows([row])
+                    logger.debug("%s", "  ".join(f"{key} {value:.6g}" for key, value in row.items()))
+                    self.logger.log({key: value for key, value in row.items() if key != "step"}, self.step)
+        self.logger.close()
         if self.processes.is_first:
             logger.info("measuring the residual error at 40 noise levels, for the samplers")
         with self._averaged():
@@ -184,16 +151,18 @@ class Pretrainer:
             self.processes.share(self.network.parameters())
             self.average = WeightAverage(self.network, self.config.optimizer.ema)
 
-    def _progress(self) -> Progress:
-        style = self.config.progress if self.processes.is_first else "none"
-        return Progress("pretraining", self.config.iterations, done=self.step, style=style)
-
     def _show(self, progress: Progress, row: Mapping[str, float]) -> None:
         step, total = int(row["step"]), self.config.iterations
         heldout = f"  held-out {self.evaluations[-1]['heldout']:.4g}" if self.evaluations else ""
         text = f"loss {row['loss']:.4g}{heldout}"
         left = row["seconds"] / max(1, step) * (total - step)
         progress.update(step, text, f"pretraining {step}/{total}  {text}  {left:.0f} s left")
+
+    def _write_rows(self, rows: Sequence[Mapping[str, float]]) -> None:
+        path = self.directory / "log.csv"
+        header = [] if path.exists() else [{name: name for name in FIELDS}]
+        with path.open("a", newline="") as file:
+            csv.DictWriter(file, FIELDS).writerows([*header, *rows])
 
     def _steps(self, end: Ending) -> Iterator[dict[str, float]]:
         started, config = time.perf_counter() - self.seconds, self.config
@@ -208,11 +177,11 @@ class Pretrainer:
             if self.step % config.logger.evaluate_every == 0 or last:
                 with self._averaged():
                     row["heldout"] = heldout_loss(self.prior, self.heldout_data.to(self.device))
-                self.evaluations.append({"step": self.step, "heldout": row["heldout"]})
             if self.step % config.logger.log_every == 0 or row:
                 row |= {"step": self.step, "loss": sum(running) / len(running), "gradient_norm": norm}
                 row |= {"learning_rate": learning_rate_at(self.step - 1, config), "seconds": round(self.seconds, 1)}
                 running.clear()
+                self.history.append(row)
                 yield row
             pictures = config.logger.pictures_every
             if pictures and self.step % pictures == 0 and self.processes.is_first:
@@ -231,9 +200,13 @@ class Pretrainer:
             generator = derived_generator(
                 config.seed, self.step, self.processes.rank * config.optimizer.compute.accumulate + part
             )
-            loss = self._part_loss(config.batch_size // self.parts, generator) / self.parts
-            loss.backward()  # type: ignore[no-untyped-call]
-            total += loss.detach()
+
+            def part_loss(count: int, generator: Generator = generator) -> Tensor:
+                loss = self._part_loss(count, generator) / self.parts
+                loss.backward()  # type: ignore[no-untyped-call]
+                return loss.detach()
+
+            total += within_memory(part_loss, config.batch_size // self.parts, "batch_size / number of parts")
         value = float(self.processes.sum(total))
         if not math.isfinite(value):
             raise self._not_finite("loss", value)
@@ -274,8 +247,8 @@ class Pretrainer:
             group["initial_lr"] = group["rate"]
         return LambdaLR(self.optimizer, lambda step: learning_rate_at(step, self.config), last_epoch=self.step - 1)
 
-    def _averaged(self) -> AveragedWeights[nn.Module]:
-        return AveragedWeights(self.network, self.average)
+    def _averaged(self) -> AbstractContextManager[nn.Module]:
+        return averaged_weights(self.network, self.average)
 
     def _save(self) -> None:
         if self.processes.is_first:
@@ -287,7 +260,7 @@ class Pretrainer:
                 "optimizer": self.optimizer.state_dict(),
                 "step": self.step,
                 "seconds": self.seconds,
-                "evaluations": self.evaluations,
+                "history": self.history,
                 "data": self._data_facts(),
             }
             save_checkpoint(self.checkpoint_path, state)
@@ -316,20 +289,17 @@ class Pretrainer:
             )
         check_tensors(self.network, state["network"], self.checkpoint_path)
         try:
-            self.network.load_state_dict({**state["network"], **state["average"]})  # weights get their present names
-            average = WeightAverage(self.network, self.config.optimizer.ema)
+            self.history = state["history"]
             self.network.load_state_dict(state["network"])
+            self.average.restore(state["average"], state["average_updates"])
             self.optimizer.load_state_dict(state["optimizer"])
         except (RuntimeError, ValueError, KeyError) as error:
             raise InvalidInputError(
                 f"the run in {str(self.directory)!r} cannot be resumed: it has another network or optimiser; "
                 "give the same keys again, or another output"
             ) from error
-        self.average = average
-        self.average.updates = state["average_updates"]
         self.step, self.seconds = state["step"], state["seconds"]
         self.schedule = self._schedule()
-        self.evaluations = state["evaluations"]
         logger.info("resumed at step %d", self.step)
 
     def _data_facts(self) -> dict[str, Any]:

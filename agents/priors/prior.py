@@ -6,7 +6,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -23,6 +23,7 @@ from agents.networks.text import Text
 from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.files import StoredPrior, explained, read_stored, write_stored
 from agents.priors.guidance import Guide, Hook, Watch, guidance_hook, physics_strength
+from scene_envs.arrays import within_memory
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.envs.settings import check_claim_guidance, check_guidance, check_physics_guidance
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -469,16 +470,20 @@ class ScenePrior(nn.Module, ABC):
         prompts = self._check_prompts(prompt, guidance, claim_guidance, count, wide)
         strength = physics_strength(physics_guidance, self.config, self.scene_type)
         generator, table = Generator(str(self.device)).manual_seed(seed), self.step_table(num_steps)
-        chunks = []
-        for start in range(0, count, batch_size):
-            texts = None if prompts is None else prompts[start : start + batch_size]
-            size = min(batch_size, count - start)
+
+        def denoised(start: int, size: int) -> Tensor:
+            texts = None if prompts is None else prompts[start : start + size]
             hook = self.sampling_hook(
                 size, wide, num_steps, prompts=texts, claim_guidance=claim_guidance, physics_guidance=strength
             )
             text = None if texts is None else self.encode_prompts(texts)
             x = self.initial(size, wide, generator)
-            chunks.append(self.run_chain(x, table, generator, text=text, guidance=guidance, eta=eta, hook=hook))
+            return self.run_chain(x, table, generator, text=text, guidance=guidance, eta=eta, hook=hook)
+
+        chunks = [
+            within_memory(partial(denoised, start), min(batch_size, count - start), "batch_size")
+            for start in range(0, count, batch_size)
+        ]
         return self.decode(torch.cat(chunks))
 
     @abstractmethod

@@ -114,11 +114,6 @@ class Asset:
     color: tuple[int, int, int]
     static: bool = False
 
-    @property
-    def article(self) -> str:
-        """The indefinite article of the display name, by sound."""
-        return indefinite_article(self.display_name)
-
     @cached_property
     def bounds(self) -> Array:
         """(2, 3): lowest and highest corner of the fine parts, m."""

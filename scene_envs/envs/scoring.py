@@ -104,6 +104,11 @@ class RewardScorer:
     The ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
     ``physics`` names the engine.
 
+    Attributes:
+        depends_on_batch: Whether the score of a scene depends on the other scenes of its batch.
+        averages_objects: Whether the reward is a mean over the objects, so that an empty slot has no credit.
+        counts_objects: Whether the reward depends on which objects there are, wherever they are.
+
     >>> scorer = RewardScorer("object_count")
     >>> scorer(SceneBatch.empty("dimsum_table", 2)).valid.tolist()
     [True, True]
@@ -116,6 +121,10 @@ class RewardScorer:
                 f"workers={workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
             )
         self._score = resolve_reward(reward)
+        facts = "depends_on_batch", "averages_objects", "counts_objects"
+        self.depends_on_batch, self.averages_objects, self.counts_objects = (
+            bool(getattr(self._score, fact, False)) for fact in facts
+        )
         self.workers, self.physics = workers, physics
         self._pool: Any = None
 
@@ -126,21 +135,6 @@ class RewardScorer:
         value = torch.where(valid, output.value, torch.zeros_like(output.value)).float()
         terms = {name: torch.nan_to_num(term.float(), 0.0, 0.0, 0.0) for name, term in output.terms.items()}
         return Score(value, valid, terms, output.per_object, output.object_flags)
-
-    @property
-    def depends_on_batch(self) -> bool:
-        """Whether the score of a scene depends on the other scenes of its batch."""
-        return bool(getattr(self._score, "depends_on_batch", False))
-
-    @property
-    def averages_objects(self) -> bool:
-        """Whether the reward is a mean over the objects, so that an empty slot has no credit."""
-        return bool(getattr(self._score, "averages_objects", False))
-
-    @property
-    def counts_objects(self) -> bool:
-        """Whether the reward depends on which objects there are, wherever they are."""
-        return bool(getattr(self._score, "counts_objects", False))
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares for scenes of this size, None where it declares none."""

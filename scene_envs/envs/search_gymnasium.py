@@ -119,6 +119,8 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     `gym.make_vec("scene_envs:SceneEnvs/Search-v0", num_envs=4, ...)` runs copies one after another. Planners should use
     `expand_batch`, which denoises many children in one batch.
 
+    torchrl's `GymWrapper` takes one environment or copies with `vector_kwargs={"autoreset_mode": "Disabled"}`.
+
     ## Version History
 
     * v0: initial version.
@@ -131,7 +133,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         problem = SearchProblem(**settings)
         self._begin(problem, render_mode, spaces.MultiBinary(problem.slots))
 
-    def _begin(self, problem: SearchProblem, render_mode: str | None, regenerate: spaces.MultiBinary) -> None:
+    def _begin(self, problem: SearchProblem, render_mode: str | None, regenerate: spaces.Space[Any]) -> None:
         """Set up an environment over ``problem``; ``regenerate`` is the space of the observed masks."""
         self.render_mode = check_render_mode(render_mode, _RENDER_MODES)
         self._viewer: LiveViewer | None = None  # the page of "human", made at the first reset
@@ -376,7 +378,7 @@ class SearchMaskEnv(SearchEnv):
 
     ## Observation Space
 
-    The `Dict` of [Search-v0](search.md#observation-space), but `regenerate` is `MultiBinary((K, N))`: the slots that
+    The `Dict` of [Search-v0](search.md#observation-space), but `regenerate` is `Box(0, 1, (K, N), int8)`: the slots that
     each mask regenerates. `info` has the same keys; its `regenerate` is the number of slots that are in any mask.
 
     ## Rewards
@@ -437,7 +439,7 @@ class SearchMaskEnv(SearchEnv):
     @takes(SearchMaskSettings)
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
         problem = MaskChoiceProblem(**settings)
-        self._begin(problem, render_mode, spaces.MultiBinary((len(problem.mask_names), problem.slots)))
+        self._begin(problem, render_mode, spaces.Box(0, 1, (len(problem.mask_names), problem.slots), np.int8))
 
     def _child(self, state: SearchState, action: int) -> SearchState:
         is_action = isinstance(action, int | np.integer) and 0 <= action < self.problem.num_actions

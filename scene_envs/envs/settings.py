@@ -19,8 +19,7 @@ PROMPT_SOURCES = ("data", "grammar")
 _MAX_SLOTS = 100_000
 _MAX_NUMBER = 1e30
 MASKS = (
-    "balanced", "blamed_or_empty", "culprits", "empty", "explicit", "infeasible", "infeasible_or_empty",
-    "lowest_scoring", "off_prompt", "penetrating", "random", "region", "unstable",
+    "balanced", "blamed_or_empty", "culprits", "empty", "infeasible", "infeasible_or_empty", "off_prompt", "random",
 )  # fmt: skip
 """Names of the mask generators of :mod:`scene_envs.envs.masks`."""
 
@@ -226,7 +225,7 @@ def _shown(value: Any) -> str:
     return "a very large number" if isinstance(value, int) and abs(value) > _MAX_NUMBER else repr(value)[:200]
 
 
-def takes(settings: type[EnvSettings]) -> Callable[[Init], Init]:
+def takes(settings: type[Any]) -> Callable[[Init], Init]:
     """Decorator of an ``__init__`` with ``**settings``: its signature shows the fields of ``settings``."""
 
     def decorate(init: Init) -> Init:

@@ -1,8 +1,7 @@
-"""Files of one scene without physics: ``.npz``, a pickled dictionary of the same arrays, and a coloured ``.glb``."""
+"""Files of one scene without physics: ``.npz`` and a coloured ``.glb``."""
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.
 
 
 def scene_arrays(scene: PlacedScene) -> dict[str, Any]:
-    """Arrays of both files, for the n objects of a scene in slot order: ``translations`` (n, 3) float64 m,
+    """Arrays of the file ``.npz``, for the n objects of a scene in slot order: ``translations`` (n, 3) float64 m,
     ``rotations`` (n, 3, 3) float64, ``categories`` and ``slots`` (n,) int64, ``welded`` (n,) bool, ``names`` (n,) text,
     ``asset_names`` (C,) text in category order, and ``scene_type``, one text.
     """
@@ -38,13 +37,6 @@ def write_npz(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene.npz``, which ``numpy.load`` alone can read."""
     path = folder / "scene.npz"
     np.savez(path, **scene_arrays(scene))
-    return path
-
-
-def write_pickle(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
-    """``scene.pkl``: the same arrays as a dictionary; only numpy is needed to load it."""
-    path = folder / "scene.pkl"
-    path.write_bytes(pickle.dumps(scene_arrays(scene), protocol=4))
     return path
 
 

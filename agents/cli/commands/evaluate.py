@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +17,6 @@ from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDepend
 from scene_envs.files import with_digest, without_digest, write_text
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from agents.priors.prior import ScenePrior
     from scene_envs.scene import SceneBatch
 
@@ -85,15 +83,8 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
 
 
 def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> list[str]:
-    """Names of groups, in their order.
-
-    Args:
-        measures: ``"all"``, a name, names joined by commas, or a list of names.
-        project: whether ``"all"`` includes ``ready``.
-
-    Raises:
-        UnknownNameError: a name that is no group.
-        InvalidInputError: no name, or something else than names.
+    """Names of groups, in their order, from ``"all"``, a name, names joined by commas, or a list of names; ``project``
+    says whether ``"all"`` includes ``ready``. An UnknownNameError for a name that is no group.
 
     >>> choose_measures("novelty, layout")
     ['layout', 'novelty']
@@ -149,7 +140,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
         )
         run.log(results.notes[-1])
     samples = results.scenes(_SAMPLES, lambda: draw(prior, settings, settings.count, batch_size=settings.batch_size))
-    _draw(samples, settings.pictures, run)
+    draw_scenes(samples, settings.pictures, run, "gallery.png")
     asked = settings.measures.split(",") if isinstance(settings.measures, str) else settings.measures
     optional = "all" in [str(name).strip() for name in asked]
     with make_pool(settings.workers, physics=settings.physics) as pool:
@@ -191,10 +182,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
 
 def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
     """The identity of the figures in ``metrics.json``, and the figures by group, without groups of which a part was
-    left out; both empty where there are none.
-
-    Raises:
-        CorruptFileError: the file is cut off, or was changed after it was written.
+    left out; both empty where there are none. A CorruptFileError if the file is cut off or was changed.
     """
     try:
         found = dict(json.loads(path.read_text(encoding="utf-8"))).get("evaluation")
@@ -213,14 +201,8 @@ def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float
 class _Results:
     """Figures by group, written to ``metrics.json`` after each group, and the samples that they are of.
 
-    Figures in the folder are kept as far as they depend on the same ``identity``.
-
-    Args:
-        run: the run in whose folder they are.
-        identity: the keys, and the digest of the prior, on which the figures depend.
-
-    Raises:
-        InvalidInputError: the figures were measured with other keys; other keys of the prompts are allowed.
+    Figures in the folder of ``run`` are kept as far as they depend on the same ``identity``: keys, and the digest of
+    the prior. An InvalidInputError if they were measured with other keys; other keys of the prompts are allowed.
     """
 
     def __init__(self, run: Run, identity: dict[str, Any]) -> None:
@@ -297,11 +279,3 @@ def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
 def _prompted(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str]) -> SceneBatch:
     guidance = {"guidance": settings.guidance, "claim_guidance": settings.claim_guidance}
     return draw(prior, settings, len(prompts), prompt=prompts, batch_size=settings.batch_size, **guidance)
-
-
-def _draw(samples: SceneBatch, count: int, run: Run) -> None:
-    """Draw ``gallery.png``, if there is geometry to draw."""
-    if not samples.scene_type.has_geometry:
-        run.log(f"no gallery: the assets of {samples.scene_type.name!r} have no geometry here")
-        return
-    draw_scenes(samples, count, run, "gallery.png")

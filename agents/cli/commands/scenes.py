@@ -87,7 +87,9 @@ def draw_scenes(batch: SceneBatch, count: int, run: Run, name: str, captions: li
     """A gallery of the first ``count`` scenes."""
     from scene_envs.render import gallery, render
 
-    if count < 1:
+    if count > 0 and not batch.scene_type.has_geometry:
+        run.log(f"no {name}: the assets of {batch.scene_type.name!r} have no geometry here")
+    if count < 1 or not batch.scene_type.has_geometry:
         return
     shown = batch[: min(count, len(batch))]
     if captions is None:

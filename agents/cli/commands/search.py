@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -13,8 +13,6 @@ from agents.configuration.composition import ProgressKeys, RewardLimitKeys, comp
 from agents.planning.settings import SearchConfig
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from scene_envs.progress import Progress
 
 

@@ -93,11 +93,6 @@ class ClaimCheck:
         """Whether the claim is true."""
         return self.expected == self.found
 
-    @property
-    def mismatch(self) -> int:
-        """Objects too many or too few."""
-        return abs(self.expected - self.found)
-
 
 @dataclass(frozen=True)
 class ObjectCount:
@@ -204,8 +199,8 @@ class PromptFacts:
     >>> from scene_envs.scene import SceneBatch
     >>> (scene,) = scene_facts(SceneBatch.empty("dimsum_table", 1))
     >>> prompt = parse_prompt("A scene with a table and two cups.", "dimsum_table")
-    >>> prompt.holds(scene), prompt.score(scene), [check.mismatch for check in prompt.check(scene)]
-    (False, 0.5, [0, 2])
+    >>> prompt.holds(scene), prompt.score(scene), [check.found for check in prompt.check(scene)]
+    (False, 0.5, [1, 0])
     """
 
     claims: tuple[Claim, ...]
