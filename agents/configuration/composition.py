@@ -521,6 +521,18 @@ class DeviceKeys:
 
 
 @dataclass
+class PrecisionKeys:
+    """Precision of the chains of a prior.
+
+    Attributes:
+        precision: number format of the products in the blocks of the network: float32, tf32 or bfloat16. Positions,
+            contacts and the last steps are always in float32.
+    """
+
+    precision: str = "float32"
+
+
+@dataclass
 class ProgressKeys:
     """Progress of the work.
 
@@ -563,7 +575,7 @@ class SamplingKeys(PromptKeys):
 
 
 @dataclass
-class DrawKeys(DeviceKeys):
+class DrawKeys(PrecisionKeys, DeviceKeys):
     """Samples of a prior.
 
     Attributes:

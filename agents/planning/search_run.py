@@ -134,6 +134,8 @@ class _Run:
 
     def __post_init__(self) -> None:
         self.prior, starts = resolve_prior(self.prior, self.config.device), self.starts
+        if self.config.precision != "float32":
+            self.prior = self.prior.with_precision(self.config.precision)
         self.fixed = {key: value for key, value in self.named.items() if key not in _LIMITS} | {"prior": self.prior}
         if starts is None:
             return

@@ -27,10 +27,10 @@ def check_files(*paths: str) -> None:
 
 
 def load_prior(settings: Any) -> ScenePrior:
-    """The prior that the keys ``prior`` and ``device`` name."""
+    """The prior that the keys ``prior``, ``device`` and ``precision`` name."""
     from agents.priors.prior import ScenePrior
 
-    return ScenePrior.load(settings.prior).to(resolve_device(settings.device))
+    return ScenePrior.load(settings.prior).to(resolve_device(settings.device)).with_precision(settings.precision)
 
 
 def draw(prior: ScenePrior, settings: DrawKeys, count: int, **keys: Any) -> SceneBatch:
