@@ -90,8 +90,8 @@ class Replays:
 
     A chain calls the network with the same layout step by step; on a GPU, launching its several hundred kernels one by
     one takes longer than computing them. Weights are read where they lie, so training may go on between calls. Calls
-    with gradients, and on other devices, are plain. If a network cannot be captured, a warning says so once, and all
-    its calls are plain from then on.
+    with gradients, and on other devices, are plain. If a network cannot be captured, or its graph gives other values,
+    a warning says so once, and all its calls are plain from then on.
 
     Args:
         capture: makes the graph of a call.
@@ -141,6 +141,10 @@ class Replays:
             if self._pool is None and self._on == "cuda":
                 self._pool = torch.cuda.graph_pool_handle()  # one memory for all graphs: no two run at once
             replay, outputs = self._capture(lambda: network(*own, **others), self._pool)
+            replay()
+            pair = [(value,) if isinstance(value, Tensor) else value for value in (outputs, network(*own, **others))]
+            if not all(torch.allclose(a, b, 1e-2, 1e-3) for a, b in zip(*pair, strict=True)):
+                raise RuntimeError("the graph gives other values than the network")
         except Exception as error:  # what an operation raises during a capture is up to it
             self._fails, name = True, type(network).__name__
             _LOGGER.warning(

@@ -57,7 +57,7 @@ def test_the_third_call_of_a_layout_is_captured_and_later_ones_are_replayed() ->
         moved, doubled = replays.run(network, torch.full((2,), float(value)), shift=torch.ones(2))
         assert moved.tolist() == [2.0 * value + 1.0] * 2
         assert doubled.tolist() == [2.0 * value] * 2
-    assert (recorder.captured, recorder.replayed) == (1, 3)
+    assert (recorder.captured, recorder.replayed) == (1, 4)  # one replay is compared with the call
     earlier = replays.run(network, torch.full((2,), 7.0), shift=torch.ones(2))[1]
     network.factor.mul_(2.0)  # weights are read where they lie
     assert replays.run(network, torch.full((2,), 7.0), shift=torch.ones(2))[1].tolist() == [28.0, 28.0]
@@ -95,6 +95,18 @@ def test_a_network_that_cannot_be_captured_says_so_once_and_runs(caplog: pytest.
     assert "not permitted" in record.message
 
 
+@torch.no_grad()
+def test_a_graph_that_gives_other_values_is_not_used(caplog: pytest.LogCaptureFixture) -> None:
+    def wrong(call: Callable[[], Any], pool: Any) -> Any:
+        return lambda: None, [2.0 * value for value in call()]
+
+    replays, network = Replays(wrong, on="cpu"), Doubling()
+    with caplog.at_level(logging.WARNING):
+        for _ in range(5):
+            assert replays.run(network, torch.ones(2))[0].tolist() == [2.0] * 2
+    assert "the graph gives other values than the network" in caplog.text
+
+
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
 def test_a_replayed_chain_gives_the_same_scenes(process: str) -> None:
     prior, recorder = tiny_prior("dimsum_table", process=process), Recorder()
@@ -109,7 +121,7 @@ def test_a_replayed_chain_gives_the_same_scenes(process: str) -> None:
     prior.denoiser.replays = Replays(capture, on="cpu")
     assert torch.equal(prior.sample(3, num_steps=8, seed=2).tensor, expected.tensor)
     assert recorder.captured == 1
-    assert recorder.replayed == 6
+    assert recorder.replayed == 7
 
 
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
