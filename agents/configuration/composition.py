@@ -652,5 +652,5 @@ class TrainingKeys(DeviceKeys):
     output: str = ""
 
 
-MEASURE_NAMES = ("layout", "physics", "ready", "stability", "fsd", "novelty", "prompts", "classifier", "renders", "fid")
+MEASURE_NAMES = ("layout", "physics", "ready", "stability", "fsd", "novelty", "prompts", "classifier", "renders")
 """Groups of measures, in the order in which they are computed: cheap ones first."""

@@ -30,7 +30,6 @@ from agents.evaluation.layouts import (
 )
 from agents.evaluation.physics_figures import physics_figures, ready_figures, stability_figures
 from agents.evaluation.pictures import (
-    frechet_inception_distance,
     frechet_scene_distance,
     render_classifier_accuracy,
 )
@@ -294,7 +293,6 @@ class EvaluationInputs:
     follow: Callable[[list[str]], SceneBatch] | None = None  # samples a scene per prompt; None without prompts
     pool: PhysicsPool | None = None  # None computes in this process
     seed: int = 0  # of the classifiers and prompts
-    fid_weights: str = ""  # path of the weights of an Inception-v3
     prompts: int | None = None  # number of real scenes whose prompts the samples follow; None for all
     left_out: dict[str, str] = field(default_factory=dict)  # gets figures that this machine cannot compute, and why
 
@@ -321,15 +319,6 @@ def _accuracy(name: str, classify: Callable[..., Accuracy], inputs: EvaluationIn
         return {name: accuracy.mean, f"{name}_std": accuracy.std}
 
     return _with_floor(measure, inputs)
-
-
-def _fid(inputs: EvaluationInputs) -> Figures:
-    if not inputs.fid_weights:
-        raise InvalidInputError("FID needs fid_weights=, the path of an Inception-v3's weights")
-    real, weights = inputs.real.reference, inputs.fid_weights
-    return _with_floor(
-        lambda batch: {"frechet_inception_distance": frechet_inception_distance(batch, real, weights)}, inputs
-    )
 
 
 def _prompts(inputs: EvaluationInputs) -> Figures:
@@ -370,7 +359,6 @@ MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
     "prompts": _prompts,
     "classifier": lambda inputs: _accuracy("classifier_accuracy", classifier_accuracy, inputs),
     "renders": lambda inputs: _accuracy("render_accuracy", render_classifier_accuracy, inputs),
-    "fid": _fid,
 }
 """Groups of measures, in the order in which they are computed: cheap ones first."""
 
@@ -416,7 +404,6 @@ READING: dict[str, str] = {
     "render_accuracy": "accuracy of a CNN on their semantic renders; 0.5 is chance, lower is better",
     "render_accuracy_std": "its spread over the seeds",
     "frechet_scene_distance": "FSD, on features of a frozen set encoder (no FID); lower is better",
-    "frechet_inception_distance": "FID of semantic renders; lower is better",
     "prompt_guidance": "weight of classifier-free guidance of the samples with prompts; 0 for none",
     "prompt_following": "samples of which every claim of their prompt is true; higher is better",
     r"prompt_(counts|names|relations)": "the same among prompts on {}",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable
@@ -10,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.cli.commands.scenes import check_files, draw, draw_scenes, load_prior
+from agents.cli.commands.scenes import draw, draw_scenes, load_prior
 from agents.cli.run_folder import Run
 from agents.configuration.composition import MEASURE_NAMES, DrawKeys, OutputKeys
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, unknown_name
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from scene_envs.scene import SceneBatch
 
 _SAMPLES, _PROMPTED = "scenes.safetensors", "prompted.safetensors"
-_NOT_PART = ("measures", "project", "fid_weights", "pictures", "workers", "device", "output")
+_NOT_PART = ("measures", "project", "pictures", "workers", "device", "output")
 """Keys that change no figure of a group."""
 _OF_PROMPTS = {"prompt_count", "guidance", "claim_guidance"}
 """Keys that change only the figures of the group ``prompts``."""
@@ -55,10 +54,9 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
         claim_guidance: strength with which samples are guided to the numbers and places that their prompts give, 0 for
             none.
         seed: seed of the samples, the real scenes and the classifiers.
-        measures: all, or some of layout, physics, ready, stability, fsd, novelty, prompts, classifier, renders, fid,
-            written as layout or [layout, physics].
+        measures: all, or some of layout, physics, ready, stability, fsd, novelty, prompts, classifier, renders, written
+            as layout or [layout, physics].
         project: include ready, the measures after projection and settling, in all.
-        fid_weights: file with the weights of an Inception-v3, for fid.
         pictures: number of samples in gallery.png; 0 draws none.
         output: folder for metrics.json, metrics.md, scenes.safetensors and gallery.png; the same command again measures
             only the missing groups.
@@ -71,7 +69,6 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
     claim_guidance: float = 0.0
     measures: Any = "all"
     project: bool = True
-    fid_weights: str = ""
     pictures: int = 16
 
     def __post_init__(self) -> None:
@@ -112,8 +109,6 @@ def check(settings: EvaluateConfig) -> None:
             f"prompt_count={settings.prompt_count} must be from 2 to count={settings.count}, whose scenes the prompts "
             "are of; null takes all of them"
         )
-    if settings.fid_weights:
-        check_files(settings.fid_weights)
 
 
 def run(settings: EvaluateConfig, run: Run) -> None:
@@ -152,7 +147,6 @@ def run(settings: EvaluateConfig, run: Run) -> None:
             else None,
             pool,
             settings.seed,
-            settings.fid_weights,
             settings.prompt_count,
         )
         for name in missing:
@@ -216,11 +210,9 @@ class _Results:
         if not changed:
             return
         stale = [_PROMPTED] if changed & _OF_PROMPTS else []
-        if known and changed <= _OF_PROMPTS | {"fid_weights"}:
+        if known and changed <= _OF_PROMPTS:
             if stale and self.groups.pop("prompts", None) is not None:
                 run.say(f"{path} has other {' and '.join(sorted(changed & _OF_PROMPTS))}: measuring the prompts anew")
-            if "fid_weights" in changed:
-                self.groups.pop("fid", None)
         elif known and changed != {"digest"}:
             told = [f"{key} was {known.get(key)!r}, is {identity.get(key)!r}" for key in sorted(changed - {"digest"})]
             raise InvalidInputError(
@@ -271,8 +263,6 @@ def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
 
     keys = {key: value for key, value in vars(settings).items() if key not in _NOT_PART}
     keys["physics_guidance"] = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
-    if settings.fid_weights:
-        keys["fid_weights"] = hashlib.sha256(Path(settings.fid_weights).read_bytes()).hexdigest()[:16]
     return {**keys, "digest": prior_digest(prior)}
 
 
