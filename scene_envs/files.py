@@ -105,22 +105,6 @@ def trim_folder(folder: Path, size: int) -> None:
             path.unlink(missing_ok=True)
 
 
-def is_file(path: Path) -> bool:
-    """Whether ``path`` is a file; False also for names that the operating system does not allow."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
-
-
-def exists(path: Path) -> bool:
-    """Whether ``path`` exists; False also for names that the operating system does not allow."""
-    try:
-        return path.exists()
-    except (OSError, ValueError):
-        return False
-
-
 def storage_error(path: str | os.PathLike[str], error: OSError) -> StorageError:
     """The error to raise when ``path`` could not be written."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
@@ -331,7 +315,7 @@ def find_scenes(path: Path) -> Path:
     """The file or folder of scenes that ``scenes=`` names; for a run's folder, the scene file in it. Raises
     InvalidInputError where ``path`` does not exist, or the folder holds a prior and no scenes.
     """
-    if not exists(path):
+    if not os.path.exists(path):  # False also for names that the operating system does not allow
         raise InvalidInputError(
             f"scenes={str(path)[:200]!r}: no scene file, run or dataset is there; sample and generate make them"
         )
