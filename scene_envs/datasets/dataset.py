@@ -20,14 +20,15 @@ from scene_envs.datasets.files import (
     METADATA,
     DatasetInfo,
     Rows,
+    encode_shard,
     find_files,
     find_metadata,
     make_metadata,
     read_metadata,
     read_rows,
     shard_name,
+    write_bytes,
     write_metadata,
-    write_shard,
 )
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.files import find_scenes, is_dataset, scene_files
@@ -216,7 +217,7 @@ class SceneDataset:
         for index, start in enumerate(range(0, len(self), shard_size)):
             chunk = slice(start, start + shard_size)
             scenes = self.normalizer.normalize(self.tensor[chunk]).numpy()
-            write_shard(folder / shard_name(index), scenes, self.prompt_sets[chunk], {})
+            write_bytes(folder / shard_name(index), encode_shard(scenes, self.prompt_sets[chunk], {}))
         return folder
 
 

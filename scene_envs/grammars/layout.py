@@ -74,10 +74,6 @@ class Tower:
         """The same tower in a frame at (``x``, ``y``) m, turned by ``yaw`` rad."""
         return replace(self, where=Moved(self.where, x, y, yaw), yaw=self.yaw.turned(yaw))
 
-    def count(self) -> int:
-        """Number of objects in this tower, on it, in it and next to it."""
-        return sum(len(tower.assets) + len(tower.contents) for tower in self.walk())
-
 
 @dataclass(frozen=True)
 class Surface:
