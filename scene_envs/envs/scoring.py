@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
@@ -87,15 +87,13 @@ class Score:
 
     def row(self, index: int) -> Score:
         """The verdict on one scene, as a batch of one."""
-        return self._each(lambda values: values[index : index + 1])
-
-    def _each(self, change: Callable[[Tensor], Tensor]) -> Score:
+        rows = slice(index, index + 1)
         return Score(
-            change(self.value),
-            change(self.valid),
-            {name: change(term) for name, term in self.terms.items()},
-            None if self.per_object is None else change(self.per_object),
-            {name: change(flag) for name, flag in self.object_flags.items()},
+            self.value[rows],
+            self.valid[rows],
+            {name: term[rows] for name, term in self.terms.items()},
+            None if self.per_object is None else self.per_object[rows],
+            {name: flag[rows] for name, flag in self.object_flags.items()},
         )
 
 
