@@ -27,13 +27,9 @@ Check = Callable[["_Subject"], None]
 def check_reward(
     reward: Any, scene_type: str | SceneType = "dimsum_table", *, context: RewardContext | None = None, seed: int = 0
 ) -> list[str]:
-    """Check a reward against everything that training and search rely on.
+    """Check a reward (a name, mapping, function, class or reward) against everything that training and search rely on.
 
-    Args:
-        reward: a name, mapping, function, class or reward.
-        scene_type: scene type of the test scenes.
-        context: context for the reward; by default a prompt per scene and no worker pool.
-        seed: seed of the test scenes.
+    The test scenes are drawn from ``seed``; by default the context has a prompt per scene and no worker pool.
 
     Returns:
         One sentence per checked clause. Scenes alone and in a batch are not compared if the reward declares

@@ -61,7 +61,6 @@ class WeightedSum:
         self.counts_objects = counts_objects(*self.rewards)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Score every part and add up."""
         outputs = _score_parts(self.rewards, batch, context)
         pairs = zip(self.rewards, outputs.values(), strict=True)
         credits = [self._credit(reward, output, batch) for reward, output in pairs if output.per_object is not None]
@@ -92,9 +91,6 @@ class WeightedSum:
 class Product:
     """Product of rewards; 0 if one of them is 0.
 
-    Args:
-        rewards: parts of the reward.
-
     >>> Product(["object_count"])(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
     tensor([1.])
     """
@@ -106,7 +102,6 @@ class Product:
         self.depends_on_batch = depends_on_batch(*self.rewards)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Score every part and multiply."""
         outputs = _score_parts(self.rewards, batch, context)
         return _combine(torch.stack([output.value for output in outputs.values()]).prod(dim=0), outputs)
 

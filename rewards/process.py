@@ -223,7 +223,6 @@ class RewardRunner:
         return facts_of(self.reward)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
-        """The largest value that the reward declares."""
         return declared_maximum(self.reward, slots, free_slots)
 
     def score(self, scene_type: Any, scenes: Any, facts: tuple[Any, int, int]) -> dict[str, Any]:

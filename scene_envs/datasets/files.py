@@ -357,13 +357,8 @@ class DatasetInfo:
 
     def categories_in(self, scene_type: SceneType, aliases: Mapping[str, str] | None = None) -> Tensor:
         """(C + 1,) int64: the category of ``scene_type`` for each category of the files; empty maps to empty.
-
-        Args:
-            scene_type: Scene type of the result; it may have assets that the files lack.
-            aliases: Mapping of model paths, or their stems, to asset names.
-
-        Raises:
-            UnknownNameError: a model path that is no asset of the scene type.
+        ``aliases`` maps model paths, or their stems, to asset names. Raises UnknownNameError for a model path that is
+        no asset of the scene type, which may have assets that the files lack.
         """
         aliases = aliases or {}
         found = []

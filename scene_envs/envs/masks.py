@@ -81,7 +81,6 @@ class EmptyMask:
         check_count("empty", "count", self.count)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated."""
         return _some(scene.is_empty[0], scene.tensor.shape[1] if self.count is None else self.count, rng)
 
 
@@ -168,7 +167,6 @@ class BalancedMask(CulpritsMask):
     """
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated."""
         free, empty = scene.is_free[0], scene.is_empty[0]
         mask = CulpritsMask(at_least=0)(scene, score, rng)
         slots, objects = int((free | empty).sum()), int(free.sum())
@@ -246,10 +244,8 @@ _MASKS: Registry[MaskGenerator] = Registry(
 
 
 def register_mask(name: str) -> Callable[[Generator], Generator]:
-    """Make a mask generator available as ``mask=name``; the same name again replaces it.
-
-    Raises:
-        InvalidInputError: the name is not one word, or the decorated object cannot be called.
+    """Make a mask generator available as ``mask=name``; the same name again replaces it. Raises InvalidInputError where
+    the name is not one word, or the decorated object cannot be called.
 
     >>> @register_mask("doctest_empty")
     ... def empty_slots(scene, score, rng):

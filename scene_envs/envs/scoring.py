@@ -27,11 +27,8 @@ function of a name or path that returns a :class:`~scene_envs.protocols.PriorLik
 
 
 def resolve_reward(reward: Any) -> SceneScorer:
-    """Scorer of ``reward``: a registered name, a mapping with settings, a function or a reward object.
-
-    Raises:
-        UnknownNameError: no reward has that name; the nearest known one is offered.
-        MissingDependencyError: no installed package resolves rewards.
+    """Scorer of ``reward``: a registered name, a mapping with settings, a function or a reward object. Raises
+    UnknownNameError for no reward of that name, and MissingDependencyError where no installed package resolves rewards.
     """
     return _resolver("reward")(reward)
 
@@ -100,12 +97,7 @@ class Score:
 class RewardScorer:
     """Scorer of batches of scenes, on their device; its reward, a name, mapping, function or object, is resolved once.
     The ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
-    ``physics`` names the engine.
-
-    Attributes:
-        depends_on_batch: Whether the score of a scene depends on the other scenes of its batch.
-        averages_objects: Whether the reward is a mean over the objects, so that an empty slot has no credit.
-        counts_objects: Whether the reward depends on which objects there are, wherever they are.
+    ``physics`` names the engine. ``depends_on_batch``, ``averages_objects`` and ``counts_objects`` are the reward's.
 
     >>> scorer = RewardScorer("object_count")
     >>> scorer(SceneBatch.empty("dimsum_table", 2)).valid.tolist()

@@ -387,13 +387,11 @@ class SearchMaskEnv(SearchEnv):
 
     ## Starting State
 
-    An episode starts from a sample of the prior; `self.np_random` draws the sample's seed. `reset(options={"state":
-    state})` starts from a given `MaskChoiceState` instead, and `options={"scene": batch}` from a given scene.
+    As in [Search-v0](search.md#starting-state); a state that is given is a `MaskChoiceState`.
 
     ## Episode End
 
-    The episode is `terminated` when nothing is left to improve: no mask has a slot, or Φ is 1. It is `truncated` at
-    depth `max_depth`, or when `max_nfe` denoiser evaluations are spent since the reset.
+    As in [Search-v0](search.md#episode-end); nothing is left to improve where no mask has a slot, or Φ is 1.
 
     ## Arguments
 
