@@ -109,7 +109,6 @@ class FeasibleObjects:
         _require_positive(self, *_LIMITS)
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value: every free slot holds a feasible object."""
         return free_slots
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
@@ -150,7 +149,6 @@ class FeasibleShare(FeasibleObjects):
     averages_objects: ClassVar[bool] = True
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value, of scenes with only feasible objects."""
         return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:

@@ -6,13 +6,14 @@ import hashlib
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 
 from rewards.base import RewardContext, RewardOutput, declared_maximum, facts_of, learned_parts
-from rewards.evaluation import current_draw, describe_error, evaluate_reward, other_draw, seeded_generators
+from rewards.evaluation import current_draw, evaluate_reward, other_draw, seeded_generators
 from rewards.registry import (
     RewardInfo,
     allow_local_rewards,
@@ -32,6 +33,7 @@ from rewards.registry import (
 from scene_envs.envs.settings import takes
 from scene_envs.errors import InvalidInputError, RewardError, RewardTimeoutError, SceneEnvsError, UnknownNameError
 from scene_envs.physics import PhysicsPool, make_pool
+from scene_envs.registry import describe_error
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type, register_scene_type
 from scene_envs.workers import START_UP, Process, WorkerFailure
@@ -192,7 +194,7 @@ class RewardRunner:
         """Call the method that the message names; raises InvalidInputError, UnknownNameError and RewardError alone."""
         method, *arguments = message
         try:
-            return getattr(self, method)(*arguments)
+            return reward_info(*arguments) if method == "describe" else getattr(self, method)(*arguments)
         except MemoryError:
             raise RewardError("the reward took more memory than reward_limits.memory allows") from None
         except SceneEnvsError as error:
@@ -221,12 +223,7 @@ class RewardRunner:
         return facts_of(self.reward)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
-        """The largest value that the reward declares."""
         return declared_maximum(self.reward, slots, free_slots)
-
-    def describe(self, name: str) -> RewardInfo:
-        """The listing of a reward, whose plug-in is imported."""
-        return reward_info(name)
 
     def score(self, scene_type: Any, scenes: Any, facts: tuple[Any, int, int]) -> dict[str, Any]:
         """Score one batch; returns the output as arrays."""
@@ -255,15 +252,12 @@ class SeededReward:
         with seeded_generators(seed):
             self.reward = resolve_reward(reward)
         self.described_by, self.name, self.seed = self.reward, reward_name(self.reward), seed
+        self.maximum = partial(declared_maximum, self.reward)
         vars(self).update(facts_of(self.reward))
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score with the seed of the run."""
         return evaluate_reward(self.reward, batch, replace(context, seed=self.seed), strict=True)
-
-    def maximum(self, slots: int, free_slots: int) -> float | None:
-        """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
-        return declared_maximum(self.reward, slots, free_slots)
 
 
 def run_reward(reward: Any, **settings: Any) -> Any:

@@ -47,7 +47,7 @@ from scene_envs.errors import (
     UnknownNameError,
     unknown_name,
 )
-from scene_envs.files import exists, find_scenes
+from scene_envs.files import find_scenes
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -314,7 +314,7 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     if (prior := getattr(settings, "prior", None)) and isinstance(prior, str):
         own_name, adapters = split_name(prior)
         find_prior(own_name)
-        for part in adapters.split("+") if adapters and not exists(Path(adapters)) else ():
+        for part in adapters.split("+") if adapters and not os.path.exists(adapters) else ():
             find_prior(part.rpartition("*")[2].strip())
     for key in ("reward", "objective"):
         _check_name("reward", getattr(settings, key, None), known_rewards)
@@ -331,7 +331,7 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
         require_one_of(settings, "progress", PROGRESS_STYLES)
     if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
         find_scenes(Path(scenes))
-    resumed = exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
+    resumed = os.path.exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
     kept = {"regularisation.scenes"} if resumed else set()  # a resumed run has them in its folder
     for key in set(_DATASETS) - kept - set(getattr(settings, "NO_PATHS", ())):
         _check_dataset(key, functools.reduce(lambda value, part: getattr(value, part, None), key.split("."), settings))
@@ -375,7 +375,7 @@ def _check_dataset(key: str, value: Any) -> None:
     if value and not any(parts):
         raise InvalidInputError(f"{key}={value[:200]!r} names no dataset; scene-envs generate makes one")
     for part in filter(None, parts):
-        if part != _GRAMMAR and not exists(Path(part)):
+        if part != _GRAMMAR and not os.path.exists(part):
             raise InvalidInputError(
                 f"{key}={value[:200]!r}: nothing is at {part[:200]!r}; name a dataset, as scene-envs generate makes one"
             )

@@ -20,14 +20,15 @@ from scene_envs.datasets.files import (
     METADATA,
     DatasetInfo,
     Rows,
+    encode_shard,
     find_files,
     find_metadata,
     make_metadata,
     read_metadata,
     read_rows,
     shard_name,
+    write_bytes,
     write_metadata,
-    write_shard,
 )
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.files import find_scenes, is_dataset, scene_files
@@ -216,19 +217,14 @@ class SceneDataset:
         for index, start in enumerate(range(0, len(self), shard_size)):
             chunk = slice(start, start + shard_size)
             scenes = self.normalizer.normalize(self.tensor[chunk]).numpy()
-            write_shard(folder / shard_name(index), scenes, self.prompt_sets[chunk], {})
+            write_bytes(folder / shard_name(index), encode_shard(scenes, self.prompt_sets[chunk], {}))
         return folder
 
 
 def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
-    """Scenes from a scene file, a folder of them, a run's folder with a scene file, a dataset or a file of a dataset.
-
-    Args:
-        path: File or folder.
-        count: Largest number of scenes, the first ones; None for all. Files are read in order of name.
-
-    Raises:
-        InvalidInputError: ``count`` is below 1, ``path`` does not exist, or its files are of several scene types.
+    """Scenes from a scene file, a folder of them, a run's folder with a scene file, a dataset or a file of a dataset:
+    the first ``count``, or all with None, of files in order of name. Raises InvalidInputError where ``count`` is below
+    1, ``path`` does not exist, or its files are of several scene types.
     """
     if count is not None and count < 1:
         raise InvalidInputError(f"count must be at least 1, or null for all, got {count}")
@@ -247,14 +243,9 @@ def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
 
 
 def to_union(batch: SceneBatch, union: SceneType) -> SceneBatch:
-    """The same scenes in the categories of ``union``, with empty slots added up to the slots of ``union``.
-
-    Args:
-        batch: B scenes of a type whose assets ``union`` has.
-        union: Result of :func:`~scene_envs.scene_types.union_scene_type`, or any scene type with those assets.
-
-    Raises:
-        InvalidInputError: an asset that ``union`` lacks.
+    """The same scenes in the categories of ``union``, with empty slots added up to the slots of ``union``, which is a
+    result of :func:`~scene_envs.scene_types.union_scene_type` or any scene type with the assets in ``batch``. Raises
+    InvalidInputError for an asset that ``union`` lacks.
     """
     known = {name: index for index, name in enumerate(union.assets)}
     table = torch.tensor([known.get(name, -1) for name in batch.scene_type.assets] + [union.num_assets])

@@ -85,19 +85,12 @@ def write_bytes(path: Path, content: bytes) -> None:
         partial.write_bytes(content)
 
 
-def write_shard(
-    path: Path, scenes: NDArray[np.float32], prompt_sets: Sequence[tuple[str, ...]], notes: Mapping[str, Any]
-) -> None:
-    """Write M scenes (M, N, D), normalised, to one parquet file; StorageError where nothing could be written.
-    ``language_annotations`` is left out when every scene has one prompt; ``notes`` go to the file's footer as JSON.
-    """
-    write_bytes(path, encode_shard(scenes, prompt_sets, notes))
-
-
 def encode_shard(
     scenes: NDArray[np.float32], prompt_sets: Sequence[tuple[str, ...]], notes: Mapping[str, Any]
 ) -> bytes:
-    """The bytes of the parquet file that :func:`write_shard` writes; equal for equal arguments."""
+    """The bytes of the parquet file of M scenes (M, N, D), normalised; equal for equal arguments.
+    ``language_annotations`` is left out when every scene has one prompt; ``notes`` go to the file's footer as JSON.
+    """
     count, slots, features = scenes.shape
     values = pa.array(np.ascontiguousarray(scenes).reshape(-1))
     rows = pa.ListArray.from_arrays(pa.array(np.arange(count * slots + 1, dtype=np.int32) * features), values)
@@ -115,7 +108,7 @@ def encode_shard(
 
 
 def read_notes(path: Path) -> dict[str, Any]:
-    """The facts that :func:`write_shard` kept in the footer, and ``rows``; raises CorruptFileError."""
+    """The facts that :func:`encode_shard` kept in the footer, and ``rows``; raises CorruptFileError."""
     file = open_parquet(path)
     footer = file.schema_arrow.metadata or {}
     try:
@@ -364,13 +357,8 @@ class DatasetInfo:
 
     def categories_in(self, scene_type: SceneType, aliases: Mapping[str, str] | None = None) -> Tensor:
         """(C + 1,) int64: the category of ``scene_type`` for each category of the files; empty maps to empty.
-
-        Args:
-            scene_type: Scene type of the result; it may have assets that the files lack.
-            aliases: Mapping of model paths, or their stems, to asset names.
-
-        Raises:
-            UnknownNameError: a model path that is no asset of the scene type.
+        ``aliases`` maps model paths, or their stems, to asset names. Raises UnknownNameError for a model path that is
+        no asset of the scene type, which may have assets that the files lack.
         """
         aliases = aliases or {}
         found = []

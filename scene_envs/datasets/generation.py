@@ -165,7 +165,13 @@ def generate(
     ) as report:
         if left:
             _make(left, scene_type, grammar, normalizer, report, workers, backend, address)
-    return _report(folder, jobs, count, perf_counter() - start)
+    reasons: Counter[str] = Counter()
+    tried = 0
+    for job in jobs:
+        notes = read_notes(job.path)
+        reasons.update(notes["reasons"])
+        tried += notes["tried"]
+    return GenerationReport(folder, count, tried, dict(reasons.most_common()), perf_counter() - start)
 
 
 def _make(
@@ -291,16 +297,6 @@ def _is_made(job: Job) -> bool:
     return True
 
 
-def _report(folder: Path, jobs: list[Job], count: int, seconds: float) -> GenerationReport:
-    reasons: Counter[str] = Counter()
-    tried = 0
-    for job in jobs:
-        notes = read_notes(job.path)
-        reasons.update(notes["reasons"])
-        tried += notes["tried"]
-    return GenerationReport(folder, count, tried, dict(reasons.most_common()), seconds)
-
-
 def fixed_normalizer(grammar: Grammar) -> Normalizer:
     """The normalizer of a grammar's scenes, a function of the grammar alone.
 
@@ -344,20 +340,16 @@ def judge_scenes(batch: SceneBatch, physics: str = "auto") -> list[str]:
     Runs in the calling process. Scenes are judged in the constructed poses; settling only tests them. The verdict on
     a scene does not depend on the others of the batch. ``physics`` names the engine.
     """
-    inside = (batch.in_workspace | batch.is_empty).all(dim=1)
-    verdicts = [KEPT if ok else "outside workspace" for ok in inside.tolist()]
-    candidates = torch.nonzero(inside).flatten()
-    if len(candidates):
-        for index, verdict in zip(candidates.tolist(), _physics(batch[candidates], physics), strict=True):
-            verdicts[index] = verdict
-    return verdicts
-
-
-def _physics(batch: SceneBatch, physics: str) -> list[str]:
     from scene_envs.physics import feasibility
 
+    inside = (batch.in_workspace | batch.is_empty).all(dim=1)
+    verdicts = ["outside workspace"] * len(batch)
+    candidates = torch.nonzero(inside).flatten()
+    if not len(candidates):
+        return verdicts
+    chosen = batch[candidates]
     result = feasibility(
-        batch,
+        chosen,
         max_penetration=MAX_PENETRATION,
         max_displacement=MAX_DISPLACEMENT,
         max_rotation=math.inf,
@@ -365,11 +357,13 @@ def _physics(batch: SceneBatch, physics: str) -> list[str]:
         physics=physics,
     )
     shallow = (result.depth <= MAX_PENETRATION).all(dim=1)
-    still = ((result.displacement <= MAX_DISPLACEMENT) | ~batch.is_free).all(dim=1)
-    return [
-        "physics failed" if not valid else "penetration" if not clear else "moved while settling" if not calm else KEPT
-        for valid, clear, calm in zip(result.valid.tolist(), shallow.tolist(), still.tolist(), strict=True)
-    ]
+    still = ((result.displacement <= MAX_DISPLACEMENT) | ~chosen.is_free).all(dim=1)
+    judged = (column.tolist() for column in (candidates, result.valid, shallow, still))
+    for index, valid, clear, calm in zip(*judged, strict=True):
+        verdicts[index] = (
+            "physics failed" if not valid else "penetration" if not clear else KEPT if calm else "moved while settling"
+        )
+    return verdicts
 
 
 @dataclass(frozen=True)

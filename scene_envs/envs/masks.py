@@ -81,7 +81,6 @@ class EmptyMask:
         check_count("empty", "count", self.count)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated."""
         return _some(scene.is_empty[0], scene.tensor.shape[1] if self.count is None else self.count, rng)
 
 
@@ -141,7 +140,7 @@ class CulpritsMask:
     at_least: int = 4
 
     def __post_init__(self) -> None:
-        check_count("culprits", "at_least", self.at_least)
+        check_count(type(self).__name__.removesuffix("Mask").lower(), "at_least", self.at_least)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         """(N,) bool, True where a slot is regenerated; ``rng`` breaks ties and draws slots."""
@@ -159,7 +158,7 @@ class CulpritsMask:
 
 
 @dataclass(frozen=True)
-class BalancedMask:
+class BalancedMask(CulpritsMask):
     """The culprits of :class:`CulpritsMask`, and random slots until the shares of objects and of empty slots are equal.
 
     Such a mask does not depend on the content of slots, like the masks of training, so the number of objects stays the
@@ -167,13 +166,7 @@ class BalancedMask:
     until ``at_least`` slots are masked, if the scene has as many.
     """
 
-    at_least: int = 4
-
-    def __post_init__(self) -> None:
-        check_count("balanced", "at_least", self.at_least)
-
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated."""
         free, empty = scene.is_free[0], scene.is_empty[0]
         mask = CulpritsMask(at_least=0)(scene, score, rng)
         slots, objects = int((free | empty).sum()), int(free.sum())
@@ -185,10 +178,12 @@ class BalancedMask:
 
 def _culprits(scene: SceneBatch, bad: Tensor, rng: np.random.Generator) -> list[int]:
     """Slots of blamed objects (``bad``, (N,) bool), without those that are feasible once others are removed."""
+    from scene_envs.physics import penetration  # loads the physics libraries, which other masks do not need
+
     blamed = torch.nonzero(bad).flatten().tolist()
     if not blamed:
         return []
-    pairs = _overlaps(scene)
+    pairs = [pair.slots for pair in penetration(scene).pairs[0] if pair.depth > MAX_PENETRATION]
     overlapping = {slot for pair in pairs for slot in pair}
     welded = set(torch.nonzero(scene.is_welded[0]).flatten().tolist())
     return cover(pairs, welded, rng) + [slot for slot in blamed if slot not in overlapping]
@@ -210,13 +205,6 @@ def cover(pairs: Sequence[tuple[int, int]], fixed: Collection[int], rng: np.rand
         chosen.add(slot)
         left = [pair for pair in left if slot not in pair]
     return sorted(chosen)
-
-
-def _overlaps(scene: SceneBatch) -> list[tuple[int, int]]:
-    """Pairs of slots that overlap deeper than feasibility allows."""
-    from scene_envs.physics import penetration  # loads the physics libraries, which other masks do not need
-
-    return [pair.slots for pair in penetration(scene).pairs[0] if pair.depth > MAX_PENETRATION]
 
 
 def _some(candidates: Tensor, count: int, rng: np.random.Generator) -> Tensor:
@@ -256,10 +244,8 @@ _MASKS: Registry[MaskGenerator] = Registry(
 
 
 def register_mask(name: str) -> Callable[[Generator], Generator]:
-    """Make a mask generator available as ``mask=name``; the same name again replaces it.
-
-    Raises:
-        InvalidInputError: the name is not one word, or the decorated object cannot be called.
+    """Make a mask generator available as ``mask=name``; the same name again replaces it. Raises InvalidInputError where
+    the name is not one word, or the decorated object cannot be called.
 
     >>> @register_mask("doctest_empty")
     ... def empty_slots(scene, score, rng):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
@@ -27,11 +27,8 @@ function of a name or path that returns a :class:`~scene_envs.protocols.PriorLik
 
 
 def resolve_reward(reward: Any) -> SceneScorer:
-    """Scorer of ``reward``: a registered name, a mapping with settings, a function or a reward object.
-
-    Raises:
-        UnknownNameError: no reward has that name; the nearest known one is offered.
-        MissingDependencyError: no installed package resolves rewards.
+    """Scorer of ``reward``: a registered name, a mapping with settings, a function or a reward object. Raises
+    UnknownNameError for no reward of that name, and MissingDependencyError where no installed package resolves rewards.
     """
     return _resolver("reward")(reward)
 
@@ -87,27 +84,20 @@ class Score:
 
     def row(self, index: int) -> Score:
         """The verdict on one scene, as a batch of one."""
-        return self._each(lambda values: values[index : index + 1])
-
-    def _each(self, change: Callable[[Tensor], Tensor]) -> Score:
+        rows = slice(index, index + 1)
         return Score(
-            change(self.value),
-            change(self.valid),
-            {name: change(term) for name, term in self.terms.items()},
-            None if self.per_object is None else change(self.per_object),
-            {name: change(flag) for name, flag in self.object_flags.items()},
+            self.value[rows],
+            self.valid[rows],
+            {name: term[rows] for name, term in self.terms.items()},
+            None if self.per_object is None else self.per_object[rows],
+            {name: flag[rows] for name, flag in self.object_flags.items()},
         )
 
 
 class RewardScorer:
     """Scorer of batches of scenes, on their device; its reward, a name, mapping, function or object, is resolved once.
     The ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
-    ``physics`` names the engine.
-
-    Attributes:
-        depends_on_batch: Whether the score of a scene depends on the other scenes of its batch.
-        averages_objects: Whether the reward is a mean over the objects, so that an empty slot has no credit.
-        counts_objects: Whether the reward depends on which objects there are, wherever they are.
+    ``physics`` names the engine. ``depends_on_batch``, ``averages_objects`` and ``counts_objects`` are the reward's.
 
     >>> scorer = RewardScorer("object_count")
     >>> scorer(SceneBatch.empty("dimsum_table", 2)).valid.tolist()

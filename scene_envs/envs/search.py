@@ -197,10 +197,6 @@ class SearchProblem:
             states = [replace(state, trace=trace(row)) for row, state in enumerate(states)]
         return states
 
-    def expand(self, state: SearchState, action: int) -> SearchState:
-        """The child of ``state`` under ``action``."""
-        return self.expand_batch([(state, action)])[0]
-
     def legal_actions(self, state: SearchState) -> Sequence[int]:
         """All inpaintings; none at ``max_depth`` and where nothing is left to improve."""
         return () if state.depth >= self.max_depth or self.is_solved(state) else self._open_actions(state)

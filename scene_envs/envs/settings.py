@@ -29,20 +29,7 @@ Init = TypeVar("Init", bound=Callable[..., None])
 
 @dataclass(frozen=True, kw_only=True)
 class EnvSettings:
-    """Settings of every environment.
-
-    Attributes:
-        scene: Scene type or its name; None means that of the prior, and ``dimsum_table`` without one.
-        prior: Name, path or prior; None means the shipped prior of the scene type.
-        num_steps: Number of denoising steps of an episode of denoising, or of each scene of a search.
-        slots: N, the number of slots per scene; None means the scene type's.
-        workers: Number of physics worker processes; 0 computes in this process, ``"ray"`` on a Ray cluster.
-        physics: Engine that computes motion: ``bullet``, ``mujoco`` or ``warp``; ``auto`` takes Bullet where it is
-            installed, else MuJoCo.
-        device: Torch device of the network and of tensors, such as ``cpu`` or ``cuda``; ``auto`` is that of a prior
-            that is given, and for a name the GPU where torch finds one, else the CPU.
-        prompt: Description of the wanted scenes, for priors that read prompts; None for none.
-        guidance: Weight of classifier-free guidance in the prior's own steps; needs a prompt.
+    """Settings of every environment, which the tables of arguments of the environments' classes describe.
 
     Raises:
         InvalidInputError: a number is outside its range.
@@ -79,11 +66,6 @@ class EnvSettings:
 class DenoisingSettings(EnvSettings):
     """Settings of the denoising environments.
 
-    Attributes:
-        reward: Name, mapping, function or reward object.
-        action_mode: ``"next_sample"`` or ``"noise"``.
-        max_action: Bound to which the entries of actions are clipped.
-
     Raises:
         InvalidInputError, UnknownNameError: a value is outside its range.
     """
@@ -107,16 +89,6 @@ class DenoisingSettings(EnvSettings):
 @dataclass(frozen=True, kw_only=True)
 class TreeSettings(EnvSettings):
     """Settings of both search environments.
-
-    Attributes:
-        objective: Any reward: name, mapping, function or reward object.
-        branching: B, the number of inpaintings to choose from.
-        max_depth: Largest number of actions per episode.
-        objective_scale: Objective at which Φ is 1; None means the largest value that it declares, or else the number
-            of free slots.
-        max_nfe: Largest number of denoiser evaluations per episode; None for any number.
-        claim_guidance: Strength of guidance to the numbers and places that the prompt gives; needs a prompt.
-        physics_guidance: Strength with which objects are moved out of overlaps and onto supports, 0 to 1.
 
     Raises:
         InvalidInputError: a value is outside its range.
@@ -146,25 +118,14 @@ class TreeSettings(EnvSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class SearchSettings(TreeSettings):
-    """Settings of the search environment with one mask.
-
-    Attributes:
-        mask: Name of a mask generator, a mapping with its settings, or a function; see :mod:`scene_envs.envs.masks`.
-    """
+    """Settings of the search environment with one mask, as :func:`~scene_envs.envs.masks.resolve_mask` takes it."""
 
     mask: Any = "blamed_or_empty"
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchMaskSettings(TreeSettings):
-    """Settings of the search environment with a choice of masks.
-
-    Attributes:
-        masks: The K masks, each like ``mask`` of :class:`SearchSettings`.
-
-    Raises:
-        InvalidInputError: no list, or an empty one.
-    """
+    """Settings of the search environment with a choice of masks; InvalidInputError for no list, or an empty one."""
 
     masks: Sequence[Any] = ("culprits", "infeasible", "empty", "infeasible_or_empty")
 

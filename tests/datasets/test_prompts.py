@@ -12,22 +12,24 @@ import pytest
 import torch
 
 from scene_envs.datasets.prompts import (
-    NameCount,
-    ObjectCount,
-    PairCount,
-    Place,
-    PlaceCount,
     PromptFacts,
-    Reference,
     SceneFacts,
-    SideClaim,
-    SupportCount,
     Tolerances,
     describe,
     describe_all,
     parse_prompt,
     scene_facts,
     viewer_axes,
+)
+from scene_envs.datasets.prompts.claims import (
+    NameCount,
+    ObjectCount,
+    PairCount,
+    Place,
+    PlaceCount,
+    Reference,
+    SideClaim,
+    SupportCount,
 )
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar

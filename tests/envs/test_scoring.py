@@ -248,7 +248,7 @@ def test_search_inpaints_under_the_prompt(reader):
     assert not torch.equal(roots[0].scene, roots[1].scene)
     assert not torch.equal(roots[0].scene, roots[2].scene)
     assert all(root.valid and 0.0 <= root.value <= 1.0 for root in roots)
-    child = first.expand(roots[0], 0)
+    (child,) = first.expand_batch([(roots[0], 0)])
     kept = ~roots[0].mask
     assert torch.equal(child.scene[kept], roots[0].scene[kept])
     assert (first.evaluations, guided.evaluations) == (6, 4)  # two roots and a child; one root with both branches

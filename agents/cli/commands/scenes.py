@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
 from scene_envs.arrays import resolve_device
 from scene_envs.errors import InvalidInputError
-from scene_envs.files import is_file
 
 if TYPE_CHECKING:
     from agents.priors.prior import ScenePrior
@@ -22,7 +21,7 @@ _TILE = (400, 300)
 def check_files(*paths: str) -> None:
     """Refuse paths at which there is no file."""
     for path in paths:
-        if not is_file(Path(path)):
+        if not os.path.isfile(path):
             raise InvalidInputError(f"{path[:200]!r} is no file; name one that is there")
 
 
