@@ -75,7 +75,7 @@ def run_demo(
         for label, tested in {"base": base, name: directory / name}.items():
             if label not in found:
                 print(f"measuring {scenes} samples of the prior {label!r}", file=sys.stderr, flush=True)
-                prior = cast(ScenePrior, resolve_prior(tested, device))
+                prior = cast(ScenePrior, resolve_prior(str(tested), device))
                 found[label] = measure_prior(prior, scenes, num_steps=num_steps, seed=seed + SAMPLE_SEED, pool=pool)
 
     processes = WorkerPool("agents.cli.commands.demo:post_train_aloud", None, workers=len(runs), environment=shares)

@@ -79,12 +79,13 @@ def corrections(batch: SceneBatch, spread: Tensor, movable: Tensor | None = None
     >>> corrections(SceneBatch.empty("dimsum_table", 1), torch.ones(3)).abs().max()
     tensor(0.)
     """
+    single = SceneBatch(batch.tensor.float(), batch.scene_type)  # as the geometry is
     free = torch.ones_like(batch.is_empty) if movable is None else movable.to(batch.tensor.device)
     parts = [
-        _corrections(batch[row : row + _SCENES], spread.to(batch.tensor), free[row : row + _SCENES])
+        _corrections(single[row : row + _SCENES], spread.to(single.tensor), free[row : row + _SCENES])
         for row in range(0, len(batch), _SCENES)
     ]
-    return torch.cat(parts) if parts else torch.zeros_like(batch.translations)
+    return torch.cat(parts).to(batch.tensor) if parts else torch.zeros_like(batch.translations)
 
 
 def _corrections(batch: SceneBatch, spread: Tensor, free: Tensor) -> Tensor:
@@ -135,7 +136,7 @@ def _geometry(library: AssetLibrary, device: torch.device) -> _Geometry:
     geometry = library_geometry(library.assets)
     levels = [asset.fine for asset in geometry.assets]
     part = torch.full((max(len(level.parts) for level in levels), len(levels)), -1)
-    corners = torch.zeros(8, *part.shape, 3)
+    corners = torch.zeros(8, *part.shape, 3, dtype=torch.float32)
     cube = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
     for asset, level in enumerate(levels):
         part[: len(level.ids), asset] = torch.from_numpy(level.ids)
