@@ -40,6 +40,12 @@ _PLAIN = (bool, int, float, str, list, dict, type(None))
 _LIMITS = ("budget", "max_nfe", "max_seconds", "baseline", "workers")
 """Keys that do not affect the states of a search: they may change when a run is resumed."""
 
+_OF_ENV = (
+    "max_depth", "num_steps", "objective_scale", "workers", "physics", "prompt", "guidance", "claim_guidance",
+    "physics_guidance",
+)  # fmt: skip
+"""Settings of a search that are arguments of its environment."""
+
 Progress = Callable[[str, int, int, float], None]
 """Called after every round with the planner's name, the expansions so far, the budget and the best Φ so far."""
 
@@ -274,18 +280,10 @@ class _Run:
             scene=self.prior.scene_type,
             objective=self.objective,
             branching=actions,
-            max_depth=config.max_depth,
-            num_steps=config.num_steps,
             prior=self.prior,
             slots=config.slots if self.starts is None else self.starts.tensor.shape[1],
             **masks,
-            objective_scale=config.objective_scale,
-            workers=config.workers,
-            physics=config.physics,
-            prompt=config.prompt,
-            guidance=config.guidance,
-            claim_guidance=config.claim_guidance,
-            physics_guidance=config.physics_guidance,
+            **{key: getattr(config, key) for key in _OF_ENV},
         )
         journal = None
         if self.folder is not None:

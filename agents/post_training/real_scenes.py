@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,8 +13,8 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from agents.post_training.rollouts import PROMPTS_NAME, PromptSets, save_prompts, stream_seed
-from agents.post_training.run_files import BASE_SAMPLES_NAME, SCENES_NAME, writing
+from agents.post_training.rollouts import PROMPTS_NAME, PromptSets, stream_seed
+from agents.post_training.run_files import BASE_SAMPLES_NAME, SCENES_NAME, write_text, writing
 from agents.post_training.settings import RegularisationSettings
 from agents.priors.prior import ScenePrior, asked_objects
 from agents.utils.process_group import ProcessGroup
@@ -113,7 +114,7 @@ def kept_scenes(
         writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
         texts.unlink(missing_ok=True)  # prompts of other scenes, left by a run without a checkpoint
         if found is not None and prior.conditional:
-            writing(f"their prompts {str(texts)!r}", lambda: save_prompts(texts, found))
+            write_text(texts, json.dumps([list(prompts) for prompts in found]) + "\n")
         processes.wait()
         return batch
     processes.wait()

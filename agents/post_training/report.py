@@ -19,14 +19,11 @@ from agents.post_training.guard import realism
 from agents.post_training.rollouts import PromptDeck, run_prompts, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
-    FAINT,
-    GUARD_COLOR,
-    REWARD_COLOR,
     SCENES_NAME,
     write_metrics,
     write_text,
 )
-from agents.post_training.settings import PostTrainConfig, held_ratio
+from agents.post_training.settings import PostTrainConfig
 from agents.post_training.trainer import PostTrainResult, post_train
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import load_checkpoint
@@ -369,7 +366,7 @@ def _page(result: PostTrainResult, before: Measured, after: Measured, metrics: M
     caption = f"Mean {reward} of each batch, and the guard." + ("" if over is None else " Shaded: over-optimised.")
     sections = [
         Section("The curve", verdict, [Picture(directory / "curve.png", caption)]),
-        *hold_sections(metrics.get("hold"), result.history, directory / "hold.png"),
+        *hold_sections(metrics.get("hold")),
         *guard_sections(guard, pictures),
         Section(
             "As sampled",
@@ -425,30 +422,9 @@ def guard_sections(guard: Mapping[str, Any], pictures: Mapping[str, Path]) -> li
     return [Section("What the guard sampled", text, shown, table=rows)]
 
 
-def hold_sections(hold: Mapping[str, Any] | None, history: Sequence[Mapping[str, float]], path: Path) -> list[Section]:
-    """A section on the target, with its picture written to ``path``; no section for a run without a target."""
-    if hold is None or hold["measured"] is None:
-        return []
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    measured = [(row["iteration"], row["guard_ratio"]) for row in history if "guard_ratio" in row]
-    weights = [(row["iteration"], row["hold_factor"]) for row in history if "hold_factor" in row]
-    figure = Figure(figsize=(8.4, 4.2), dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    upper.plot(*zip(*measured, strict=True), ".-", color=GUARD_COLOR)
-    upper.axhline(held_ratio(hold["target"]), color=FAINT, linestyle="--", linewidth=1)
-    upper.set_ylabel("held-out loss over base")
-    lower.semilogy(*zip(*weights, strict=True), color=REWARD_COLOR)
-    lower.set_ylabel("factor on the weight")
-    lower.set_xlabel("iteration")
-    for axes in (upper, lower):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=9)
-    figure.savefig(path)
-    caption = "The held-out loss with its target, and the weight of the regularisation over its first value."
-    return [Section("What was held", hold["verdict"], [Picture(path, caption)])]
+def hold_sections(hold: Mapping[str, Any] | None) -> list[Section]:
+    """A section that says whether the target was held; none for a run without a target."""
+    return [] if hold is None or hold["measured"] is None else [Section("What was held", hold["verdict"])]
 
 
 def number_rows(columns: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:

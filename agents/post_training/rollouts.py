@@ -25,7 +25,6 @@ from scene_envs.datasets.prompts import describe_all
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.scoring import grammar_prompts
 from scene_envs.errors import TrainingError
-from scene_envs.files import write_text
 from scene_envs.scene import SceneBatch
 
 STREAMS = {
@@ -256,8 +255,3 @@ def run_prompts(directory: Path, batch: SceneBatch, seed: int) -> PromptSets:
         return texts
 
     return described
-
-
-def save_prompts(path: Path, prompts: Sequence[Sequence[str]]) -> None:
-    """Write the prompts of a dataset's scenes to ``path``, as JSON."""
-    write_text(path, json.dumps([list(texts) for texts in prompts]) + "\n")

@@ -381,18 +381,15 @@ class PretrainLoggerSettings(LoggerSettings):
     Attributes:
         log_every: steps between rows of log.csv.
         evaluate_every: steps between evaluations on held-out scenes.
-        pictures_every: steps between pictures of samples; 0 draws none.
     """
 
     checkpoint_every: int = 250
     log_every: int = 20
     evaluate_every: int = 250
-    pictures_every: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_at_least(self, 1, "log_every", "evaluate_every")
-        require_at_least(self, 0, "pictures_every")
 
 
 @dataclass

@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,17 +46,6 @@ _RESIDUAL = 512
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _RATE, _RISE = 3e-3, 0.2
 """Peak learning rate of the text warm-up, and the share of its steps in which it rises."""
-
-
-def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> None:
-    """Draw a gallery of samples of a prior, ``samples-STEP.png`` in ``directory``."""
-    from scene_envs.render import gallery, render
-
-    batch = prior.sample(8, num_steps=50, seed=seed).to("cpu")
-    captions = [f"{int(count)} objects" for count in batch.counts]
-    gallery(list(render(batch, width=400, height=300)), columns=4, captions=captions).save(
-        directory / f"samples-{step:07d}.png"
-    )
 
 
 @torch.no_grad()
@@ -190,11 +178,6 @@ class Pretrainer:
                 running.clear()
                 self.history.append(row)
                 yield row
-            pictures = config.logger.pictures_every
-            if pictures and self.step % pictures == 0 and self.processes.is_first:
-                with self._averaged():
-                    draw_samples(self.prior.eval(), self.directory, self.step, config.seed)
-                self.prior.train()
             ending = self.processes.any(end.pending)
             if self.step % config.logger.checkpoint_every == 0 or last or ending:
                 self._save()

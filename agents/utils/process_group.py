@@ -100,10 +100,6 @@ class ProcessGroup:
         """The sum of each number over all processes."""
         return list(values) if self.size == 1 else self.sum(torch.tensor(values, dtype=torch.float64)).tolist()
 
-    def largest(self, value: float) -> float:
-        """The largest ``value`` of all processes."""
-        return max(self.gather(value))
-
     def any(self, flag: bool) -> bool:
         """Whether ``flag`` is set in at least one process."""
         return self.sum_numbers(float(flag))[0] > 0

@@ -270,7 +270,7 @@ def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path)
     config = PretrainConfig(
         output=str(tmp_path), data="grammar", text="vocabulary", iterations=2, batch_size=4,
         network={"hidden": 16, "depth": 1, "heads": 2},
-        logger={"log_every": 1, "evaluate_every": 2, "checkpoint_every": 2, "pictures_every": 2},
+        logger={"log_every": 1, "evaluate_every": 2, "checkpoint_every": 2},
     )  # fmt: skip
     prior, data, heldout = prepare(config)
     assert data.size == 0
@@ -281,7 +281,6 @@ def test_a_grammar_without_end_trains_a_prior_that_reads_prompts(tmp_path: Path)
     trained = Pretrainer(config, data, heldout[:8], prior).run()
     assert trained.conditional
     assert trained.card["training_scenes"] == 8
-    assert (tmp_path / "samples-0000002.png").stat().st_size > 1000
 
 
 @pytest.mark.slow

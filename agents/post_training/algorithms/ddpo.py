@@ -236,4 +236,4 @@ def accumulate_policy_gradient(
             largest = max(largest, float(result["log_ratio"]))
             clipped += float(result["clip_fraction"]) * share / len(steps)
     total, clipped = processes.sum_numbers(total, clipped)
-    return BatchGradient(total, {"log_ratio": processes.largest(largest), "clip_fraction": clipped})
+    return BatchGradient(total, {"log_ratio": max(processes.gather(largest)), "clip_fraction": clipped})
