@@ -64,7 +64,7 @@ def products_in(precision: str, like: Tensor) -> Iterator[None]:
 
 _CAPTURED_AT = 3
 """Call of a layout that is captured: the first calls of a chain may be the only ones."""
-_MOST = 48
+_MAX_GRAPHS = 48
 """Layouts that are captured; calls of further ones launch their kernels one by one."""
 
 Capture = Callable[[Callable[[], Any], Any], tuple[Callable[[], None], Any]]
@@ -115,12 +115,12 @@ class Replays:
         layout = tuple((value.shape, value.dtype) if isinstance(value, Tensor) else value for value in given)
         weights = tuple(weight.data_ptr() for weight in network.parameters())
         key = tuple(named), layout, inputs[0].device, getattr(network, "body_precision", ""), weights
-        if len(self._known) >= 4 * _MOST and key not in self._known:  # weights that were replaced, and their graphs
+        if len(self._known) >= 4 * _MAX_GRAPHS and key not in self._known:  # weights that were replaced, and their graphs
             self._known.clear()
         known = self._known.setdefault(key, 0)
         if isinstance(known, int):
             self._known[key] = known + 1
-            if known + 1 < _CAPTURED_AT or sum(not isinstance(entry, int) for entry in self._known.values()) >= _MOST:
+            if known + 1 < _CAPTURED_AT or sum(not isinstance(entry, int) for entry in self._known.values()) >= _MAX_GRAPHS:
                 return network(*inputs, **named)
             known = self._captured(network, inputs, named)
             if known is None:
