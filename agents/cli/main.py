@@ -25,7 +25,7 @@ from typing import Any
 
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import compose, format_rows, help_text, keys_of
-from agents.cli.run_folder import Run, fresh_directory
+from agents.cli.run_folder import RESUMING, Run, fresh_directory
 from agents.configuration.composition import (
     PROGRESS_STYLES,
     config_text,
@@ -119,10 +119,10 @@ def _guarded(argv: Sequence[str] | None, work: Callable[[list[str]], int]) -> in
         with terminable(signals):
             _check_text(words)
             return work(words)
-    except Terminated:
-        return _ended(TERMINATED)
-    except KeyboardInterrupt:
-        return _ended(INTERRUPTED)
+    except Terminated as error:
+        return _ended(TERMINATED, str(error))
+    except KeyboardInterrupt as error:
+        return _ended(INTERRUPTED, str(error))
     except BrokenPipeError:  # the reader of our output has gone, as in `scene-envs rewards | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
@@ -142,9 +142,9 @@ def _check_text(words: Sequence[str]) -> None:
             raise InvalidInputError(f"{ascii(word)[:200]} is no text in UTF-8; give files and folders another name")
 
 
-def _ended(status: int) -> int:
+def _ended(status: int, what_now: str = "") -> int:
     what = "terminated" if status == TERMINATED else "interrupted"
-    return _complain(f"{what}; where the output can be resumed, the same command goes on", status)
+    return _complain(f"{what}; {what_now}" if what_now else what, status)
 
 
 def entry_point() -> None:
@@ -225,7 +225,13 @@ def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> No
     else:
         settings = settings if settings.output else replace(settings, output=fresh_directory(command))
         with Run(command, settings) as run:
-            module.run(settings, run)
+            try:
+                module.run(settings, run)
+            except KeyboardInterrupt as error:
+                same = f"the same command with output={settings.output}"
+                goes_on = f"{same} goes on where this one ended"
+                begins = f"{command} keeps no partial work, so {same} begins anew"
+                raise type(error)(goes_on if command in RESUMING else begins) from error
 
 
 def _named(words: Sequence[str], keys: Sequence[str]) -> list[str]:

@@ -47,8 +47,8 @@ _OF_ENV = (
 """Settings of a search that are arguments of its environment."""
 
 Progress = Callable[[str, int, int, float], None]
-"""Called after every round with the planner's name, the expansions so far, the budget and the best objective so far (at most
-``objective_scale``)."""
+"""Called after every round with the planner's name, the expansions so far, the budget and the best objective so far (at
+most ``objective_scale``)."""
 
 
 @dataclass(frozen=True)

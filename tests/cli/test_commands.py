@@ -374,7 +374,8 @@ def test_a_reward_that_needs_prompts_is_refused_before_anything_is_sampled(
     assert main([name, f"prior={prior}", f"{key}={nested}", f"output={tmp_path / 'run'}"]) == 2
     said = capsys.readouterr()
     assert "has no prompt to compare with: give prompt=" in said.err
-    assert "scenes in" not in said.out and not (tmp_path / "run" / "metrics.json").exists()
+    assert "scenes in" not in said.out
+    assert not (tmp_path / "run" / "metrics.json").exists()
 
 
 def test_a_sample_says_how_many_claims_of_its_prompt_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
