@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import unquote
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
+from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +46,9 @@ _SAMPLES = np.array(
 ) / 4.0  # fmt: skip
 """Barycentric points (15, 3) at which a texture is read to colour a triangle."""
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-_PREFIXED = re.compile(rb"(</?)([A-Za-z_][\w.-]*):([A-Za-z_][\w.-]*)")
-"""An element with a namespace prefix, such as <drake:declare_convex/>."""
+_BEFORE_XML = re.compile(rb"\A(?:\s|\xef\xbb\xbf|<!--.*?-->)+(?=<\?xml\s)", re.DOTALL)
+_PATHS = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "SDF_PATH")
+"""Environment variables of ROS, ROS 2, Gazebo and SDFormat with folders of packages and models."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +64,7 @@ class Shape:
     path: Path | None = None  # file of a mesh
     color: Color | None = None  # colour (r, g, b) given by the model, or None
     is_convex: bool = False  # whether the model declares the mesh convex
+    part: tuple[str, bool] | None = None  # the one object of a mesh file, and whether its box is centred at the origin
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +119,10 @@ def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
 
 
 def read_mesh(path: Path) -> list[trimesh.Trimesh]:
-    """The triangle meshes of a file, z up, in the unit of the file.
+    """The triangle meshes of a file, in its axes and unit.
 
-    Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned; the up axis and
-    the unit that a COLLADA file names are applied. Raises InvalidInputError (no such file, unknown format, beyond the
+    Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned to z up; the unit
+    that a COLLADA file names is applied, its up axis is not (:func:`collada_axes`). Raises InvalidInputError (no such file, unknown format, beyond the
     limits), CorruptFileError (unreadable, no triangles, not finite) and MissingDependencyError (COLLADA without
     pycollada).
     """
@@ -131,12 +137,14 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     check_file(path)
     import trimesh
 
-    options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
+    content = _Content(path)
     try:
-        scene: Any = trimesh.load_scene(str(path), process=False, **options)
+        _PREPARED.get(suffix, lambda content: None)(content)
+        scene = content.load()
         for geometry in scene.geometry.values():
             _check_texture(geometry, path)
-        pieces = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+        found = scene.dump()
+        pieces = [mesh for mesh in found if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     except SceneEnvsError:
         raise
     except ImportError as error:
@@ -147,16 +155,170 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise CorruptFileError(f"{path} cannot be read as a {suffix[1:].upper()} mesh: {reason}") from error
+    if len(pieces) < len(found):
+        content.notes.append(f"{len(found) - len(pieces)} object(s) of points or lines left out")
     if not pieces:
         raise CorruptFileError(f"{path} holds no triangles")
     for mesh in pieces:
         _check_mesh(mesh, path)
     check_triangles(path, sum(len(mesh.faces) for mesh in pieces))
     seconds_left()
-    turn = _axes(path)
     for mesh in pieces:
-        mesh.vertices = mesh.vertices @ turn.T
+        mesh.vertices = mesh.vertices @ _axes(path).T
+        own = {str(mesh.metadata.get(key)) for key in ("name", "node")}
+        mesh.metadata["names"] = own | content.names_of(str(mesh.metadata.get("name")))
+        mesh.metadata["notes"] = tuple(f"{path.name}: {note}" for note in dict.fromkeys(content.notes))
     return pieces
+
+
+class _Content:
+    """The content of a mesh file on its way to trimesh, which reads less than the formats hold."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.type = path, path.suffix.lower()[1:]
+        self.data = path.read_bytes()
+        self.notes: list[str] = []  # what is not loaded
+        self.names: dict[str, str] = {}  # names of the objects of the file, by the names that trimesh begins theirs with
+
+    def load(self) -> Any:
+        """The scene that trimesh makes of the data."""
+        import trimesh
+
+        options: dict[str, Any] = {"obj": {"split_objects": True}, "dae": {"ignore_broken": False}}.get(self.type, {})
+        resolver = trimesh.resolvers.FilePathResolver(str(self.path))
+        file = BytesIO(self.data)
+        file.name = self.path.name
+        return trimesh.load_scene(file, file_type=self.type, resolver=resolver, process=False, **options)
+
+    def names_of(self, name: str) -> set[str]:
+        """The names in the file of an object that trimesh calls ``name``."""
+        begin = [known for known in self.names if name == known or name.startswith(f"{known}_")]
+        longest = max(begin, key=len, default="")
+        return {longest, self.names[longest]} if longest else set()
+
+    def expect(self, names: Iterable[str], what: str) -> None:
+        """Note the files of these names that are not there."""
+        for name in dict.fromkeys(names):
+            if name and not any((self.path.parent / n).is_file() for n in (name, unquote(name.replace("\\", "/")))):
+                self.notes.append(f"its {what} {name!r} is not there")
+
+
+def cut_polygons(points: Array, corners: NDArray[np.int64], counts: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Triangles of polygons of any shape: for each of ``counts`` corners, rows (T, 3) of positions in ``corners``,
+    which are rows of ``points`` (V, 3). Convex polygons are fans, others lose one ear after another.
+
+    >>> dart = np.array([[0.0, 0, 0], [2, 1, 0], [0, 2, 0], [1, 1, 0]])
+    >>> [triangles.tolist() for triangles in cut_polygons(dart, np.arange(4), np.array([4]))]
+    [[[3, 0, 1], [1, 2, 3]]]
+    """
+    starts = np.cumsum(counts) - counts
+    cut: list[Any] = [np.zeros((0, 3), dtype=np.int64)] * len(counts)
+    for count in np.unique(counts[counts >= 3]).tolist():
+        chosen = np.flatnonzero(counts == count)
+        at = np.arange(1, count - 1)
+        fan = np.column_stack([np.zeros_like(at), at, at + 1])
+        rings = points[corners[starts[chosen, None] + np.arange(count)]]  # (P, count, 3)
+        edges = np.roll(rings, -1, axis=1) - rings
+        turns = np.cross(np.roll(edges, 1, axis=1), edges)
+        normals = np.cross(rings - rings[:, :1], np.roll(rings, -1, axis=1) - rings[:, :1]).sum(axis=1)
+        bent = np.einsum("pki,pi->pk", turns, normals) <= 1e-9 * (normals**2).sum(axis=1)[:, None]
+        for index, ring, normal, is_concave in zip(chosen, rings, normals, bent.any(axis=1), strict=True):
+            cut[index] = starts[index] + (_ears(ring, normal) if count > 3 and is_concave else fan)
+    return cut
+
+
+def _ears(ring: Array, normal: Array) -> NDArray[np.int64]:
+    """Triangles (n - 2, 3) of a polygon (n, 3) with its normal, ear after ear."""
+    keep = np.delete(np.arange(3), np.abs(normal).argmax())
+    flat = ring[:, keep] * [1.0, np.linalg.det(np.eye(3)[[*keep, np.abs(normal).argmax()]])]
+    flat = flat * [1.0, np.sign(normal[np.abs(normal).argmax()]) or 1.0]
+
+    def side(a: Array, b: Array, c: Array) -> Array:  # above 0 where c lies left of a to b
+        return np.asarray((b[0] - a[0]) * (c[..., 1] - a[1]) - (b[1] - a[1]) * (c[..., 0] - a[0]))
+
+    tiny = 1e-9 * float(np.ptp(flat, axis=0).max()) ** 2
+    left, found = list(range(len(ring))), []
+    while len(left) > 3:
+        ear = 0
+        for index in range(len(left)):
+            a, b, c = (flat[left[(index + step) % len(left)]] for step in (-1, 0, 1))
+            others = flat[left]
+            others = others[~((others == a) | (others == b) | (others == c)).all(axis=1)]
+            inside = (side(a, b, others) >= -tiny) & (side(b, c, others) >= -tiny) & (side(c, a, others) >= -tiny)
+            if side(a, b, c) > tiny and not inside.any():
+                ear = index
+                break
+        found.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
+        del left[ear]
+    return np.array([*found, left])
+
+
+_KEYWORD = re.compile(r"[ \t]*(v|vt|vn|f|o|g|usemtl|mtllib|l|p|curv2?|surf)[ \t]+(.*)")
+
+
+def _prepare_obj(content: _Content) -> None:
+    """Polygons cut into triangles, relative indices made absolute, and what is not loaded."""
+    from trimesh.util import decode_text
+
+    lines = decode_text(content.data).replace("\\\r\n", " ").replace("\\\n", " ").splitlines()
+    points: list[list[float]] = []
+    polygons: list[tuple[int, list[list[str]]]] = []  # line, and the words of each corner
+    libraries: list[str] = []
+    sizes = {"v": 0, "vt": 0, "vn": 0}
+    for number, line in enumerate(lines):
+        match = _KEYWORD.match(line)
+        if match is None:
+            continue
+        key, rest = match[1], match[2].strip()
+        lines[number] = f"{key} {rest}"
+        if key in sizes:
+            sizes[key] += 1
+            if key == "v":
+                points.append([float(word) for word in rest.split()[:3]])
+        elif key == "f":
+            corners = [word.split("/") for word in rest.partition("#")[0].split()]
+            for corner in corners if "-" in rest else ():
+                for at, (word, size) in enumerate(zip(corner, sizes.values(), strict=False)):
+                    corner[at] = str(size + 1 + int(word)) if word.startswith("-") else word
+            polygons.append((number, corners))
+        elif key == "mtllib":
+            libraries.append(rest)
+        elif key == "o":
+            content.names[rest] = rest
+        elif key not in ("g", "usemtl"):
+            content.notes.append("its points, lines and curves are left out")
+    counts = np.array([len(corners) for _, corners in polygons], dtype=np.int64)
+    index = np.array([int(corner[0]) - 1 for _, corners in polygons for corner in corners], dtype=np.int64)
+    if (counts > 3).any() and 0 <= index.min() <= index.max() < len(points) and len({*map(len, points)}) == 1:
+        cut = cut_polygons(np.array(points), index, counts)
+    else:
+        cut = [np.arange(count).reshape(-1, 3) + start for count, start in zip(counts, np.cumsum(counts) - counts)]
+    words = ["/".join(corner) for _, corners in polygons for corner in corners]
+    for (number, _), triangles in zip(polygons, cut, strict=True):
+        lines[number] = "\n".join("f " + " ".join(words[at] for at in row) for row in triangles.tolist())
+    content.data = "\n".join(lines).encode()
+    content.notes += [f"its second material file {name!r} is not read" for name in libraries[1:]]
+    content.expect(libraries[:1], "material file")
+    for library in libraries[:1]:
+        if (content.path.parent / library).is_file():
+            text = decode_text((content.path.parent / library).read_bytes())
+            content.expect(re.findall(r"^\s*map_Kd\s+(.*?)\s*$", text, re.MULTILINE | re.IGNORECASE), "texture")
+
+
+def _prepare_off(content: _Content) -> None:
+    """Polygons cut into triangles."""
+    from trimesh.util import comment_strip, decode_text
+
+    words = comment_strip(decode_text(content.data)).split("OFF", 1)[-1].split("\n")
+    rows = [line.split() for line in words if line.strip()]
+    vertices, faces = int(rows[0][0]), int(rows[0][1])
+    points = np.array([row[:3] for row in rows[1 : vertices + 1]], dtype=np.float64)
+    found = [[int(word) for word in row[1 : int(row[0]) + 1]] for row in rows[vertices + 1 : vertices + faces + 1]]
+    counts, corners = np.array([len(face) for face in found], dtype=np.int64), np.array(sum(found, []), dtype=np.int64)
+    if (counts > 3).any() and 0 <= corners.min() <= corners.max() < vertices:
+        triangles = corners[np.concatenate(cut_polygons(points, corners, counts))]
+        text = [f"OFF\n{vertices} {len(triangles)} 0", *map(" ".join, rows[1 : vertices + 1])]
+        content.data = "\n".join([*text, *(f"3 {a} {b} {c}" for a, b, c in triangles.tolist())]).encode()
 
 
 def _check_content(path: Path) -> None:
@@ -196,18 +358,24 @@ def _check_texture(mesh: Any, path: Path) -> None:
 
 
 def _axes(path: Path) -> Array:
-    """(3, 3): file axes and unit to z up and metres, where the format defines them."""
-    suffix = path.suffix.lower()
-    if suffix in (".glb", ".gltf"):
+    """(3, 3): axes and unit of the file to z up, for glTF, and metres, for COLLADA."""
+    if path.suffix.lower() in (".glb", ".gltf"):
         return _Y_UP
-    if suffix != ".dae":
+    unit = read_xml(path).find("asset/unit") if path.suffix.lower() == ".dae" else None
+    return np.eye(3) if unit is None else np.eye(3) * positive(unit.get("meter", "1"), 1, path, "unit of the asset")[0]
+
+
+def collada_axes(path: Path) -> Array:
+    """(3, 3) rotation from the up axis that a COLLADA file names to z up. A URDF or SDF does not use it: RViz, Gazebo
+    and PyBullet take the coordinates of its meshes as they are. Identity for other files.
+    """
+    if path.suffix.lower() != ".dae":
         return np.eye(3)
-    asset = ElementTree.parse(path).getroot().find("{*}asset")
-    up = (asset.findtext("{*}up_axis") or "Y_UP").strip() if asset is not None else "Y_UP"
-    unit = asset.find("{*}unit") if asset is not None else None
-    meter = float(unit.get("meter", "1")) if unit is not None else 1.0
-    turns = {"X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "Z_UP": np.eye(3)}
-    return meter * turns.get(up, _Y_UP)
+    up = (read_xml(path).findtext("asset/up_axis") or "Y_UP").strip()
+    return {"X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "Z_UP": np.eye(3)}.get(up, _Y_UP)
+
+
+_PREPARED = {".obj": _prepare_obj, ".off": _prepare_off}
 
 
 def bare(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -333,22 +501,20 @@ def _corner_normals(mesh: trimesh.Trimesh) -> Array:
 
 
 def read_xml(path: Path) -> Element:
-    """The root element of an XML file; prefixes that are never declared are tolerated. Raises CorruptFileError, with
-    the line, for a file that cannot be read or is no XML, and as :func:`check_file` does.
+    """The root element of an XML file. Names keep their prefixes, which need no declaration, and comments may come
+    before the declaration, as in other readers. Raises CorruptFileError, with the line, for a file that cannot be read
+    or is no XML, and as :func:`check_file` does.
     """
     check_file(path)
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler, parser.CharacterDataHandler = builder.start, builder.data
+    parser.EndElementHandler = builder.end
     try:
-        data = path.read_bytes()
+        parser.Parse(_BEFORE_XML.sub(b"", path.read_bytes()), True)
+        return builder.close()
     except OSError as error:
         raise CorruptFileError(f"{path} cannot be read: {error.strerror or error}") from error
-    try:
-        return ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
-        if "unbound prefix" in str(error):
-            try:
-                return ElementTree.fromstring(_PREFIXED.sub(rb"\1\2.\3", data))
-            except ElementTree.ParseError as other:
-                error = other
+    except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: its encoding
         raise CorruptFileError(f"{path} is not well-formed XML: {error}") from error
 
 
@@ -388,27 +554,44 @@ def color_of(text: str | None, path: Path, where: str) -> Color | None:
 
 
 def find_mesh(uri: str, path: Path, where: str) -> Path:
-    """The file that ``uri`` names in the model at ``path``: relative, absolute, file://, package:// or model://. A
-    package is searched above the model and in ``ROS_PACKAGE_PATH``; InvalidInputError names the places searched.
+    """The file that ``uri`` names in the model at ``path``: relative, absolute, file://, package:// or model://.
+
+    A package is a folder above the model, or beside one of these, with that name or with that name in its
+    ``package.xml``, or a folder of the paths of ROS and Gazebo. InvalidInputError names the places searched.
     """
     text = uri.strip()
     scheme, separator, rest = text.partition("://")
     if not separator:
         scheme, rest = "", text
-    rest = rest.replace("\\", "/")
-    folder = path.parent
-    candidates = [Path(rest)] if scheme == "file" else [folder / rest]
-    if scheme in ("package", "model"):
-        package, _, inside = rest.partition("/")
-        for parent in (folder, *folder.parents):
-            candidates += [parent / rest, parent / inside] if parent.name == package else [parent / rest]
-        roots = filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep))
-        candidates += [candidate for root in roots for candidate in (Path(root) / rest, Path(root) / inside)]
-        candidates.append(folder / inside)
-    elif scheme not in ("", "file"):
+    if scheme not in ("", "file", "package", "model"):
         raise InvalidInputError(f"{path}: {where} refers to {uri!r}; only files, package:// and model:// can be read")
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate.resolve()
-    more = ", the folders above it or ROS_PACKAGE_PATH" if scheme in ("package", "model") else ""
-    raise InvalidInputError(f"{path}: {where} refers to the mesh {uri!r}, which does not exist in {folder}{more}")
+    for named in dict.fromkeys((rest, unquote(rest))):
+        for candidate in _places(scheme, Path(named.replace("\\", "/")), path.parent):
+            if candidate.is_file():
+                return candidate.resolve()
+    more = f", a package above or beside it, or the folders of {', '.join(_PATHS)}" if scheme else ""
+    raise InvalidInputError(f"{path}: {where} refers to the mesh {uri!r}, which does not exist in {path.parent}{more}")
+
+
+def _places(scheme: str, rest: Path, folder: Path) -> Iterator[Path]:
+    """Files that a URI of this scheme and path may name, in the order of the search."""
+    yield rest if scheme == "file" else folder / rest
+    if not scheme:
+        return
+    roots = [Path(root) for name in _PATHS for root in os.environ.get(name, "").split(os.pathsep) if root]
+    roots += [root / "share" for root in roots]  # a prefix of ROS 2
+    yield from (root / rest for root in roots)
+    if scheme == "file":
+        return
+    package, inside = rest.parts[0] if rest.parts else "", Path(*rest.parts[1:])
+    above = (folder, *folder.parents)
+    yield from (parent / inside if parent.name == package else parent / rest for parent in above)
+    yield from (root / inside for root in roots if root.name == package)
+    for parent in (*above, *roots):
+        for manifest in (parent / "package.xml", *sorted(parent.glob("*/package.xml"))):
+            try:
+                if manifest.is_file() and (read_xml(manifest).findtext("name") or "").strip() == package:
+                    yield manifest.parent / inside
+            except (OSError, SceneEnvsError):
+                continue
+    yield folder / inside
