@@ -229,9 +229,8 @@ def cut_polygons(points: Array, corners: NDArray[np.int64], counts: NDArray[np.i
 
 def _ears(ring: Array, normal: Array) -> NDArray[np.int64]:
     """Triangles (n - 2, 3) of a polygon (n, 3) with its normal, ear after ear."""
-    keep = np.delete(np.arange(3), np.abs(normal).argmax())
-    flat = ring[:, keep] * [1.0, np.linalg.det(np.eye(3)[[*keep, np.abs(normal).argmax()]])]
-    flat = flat * [1.0, np.sign(normal[np.abs(normal).argmax()]) or 1.0]
+    axis = int(np.abs(normal).argmax())
+    flat = ring[:, [(axis + 1) % 3, (axis + 2) % 3]] * [1.0, np.sign(normal[axis]) or 1.0]  # counterclockwise
 
     def side(a: Array, b: Array, c: Array) -> Array:  # above 0 where c lies left of a to b
         return np.asarray((b[0] - a[0]) * (c[..., 1] - a[1]) - (b[1] - a[1]) * (c[..., 0] - a[0]))
@@ -243,7 +242,7 @@ def _ears(ring: Array, normal: Array) -> NDArray[np.int64]:
         for index in range(len(left)):
             a, b, c = (flat[left[(index + step) % len(left)]] for step in (-1, 0, 1))
             others = flat[left]
-            others = others[~((others == a) | (others == b) | (others == c)).all(axis=1)]
+            others = others[~(others[:, None] == [a, b, c]).all(axis=2).any(axis=1)]
             inside = (side(a, b, others) >= -tiny) & (side(b, c, others) >= -tiny) & (side(c, a, others) >= -tiny)
             if side(a, b, c) > tiny and not inside.any():
                 ear = index
@@ -314,7 +313,8 @@ def _prepare_off(content: _Content) -> None:
     vertices, faces = int(rows[0][0]), int(rows[0][1])
     points = np.array([row[:3] for row in rows[1 : vertices + 1]], dtype=np.float64)
     found = [[int(word) for word in row[1 : int(row[0]) + 1]] for row in rows[vertices + 1 : vertices + faces + 1]]
-    counts, corners = np.array([len(face) for face in found], dtype=np.int64), np.array(sum(found, []), dtype=np.int64)
+    counts = np.array([len(face) for face in found], dtype=np.int64)
+    corners = np.array([corner for face in found for corner in face], dtype=np.int64)
     if (counts > 3).any() and 0 <= corners.min() <= corners.max() < vertices:
         triangles = corners[np.concatenate(cut_polygons(points, corners, counts))]
         text = [f"OFF\n{vertices} {len(triangles)} 0", *map(" ".join, rows[1 : vertices + 1])]
