@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -164,7 +166,7 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     check_triangles(path, sum(len(mesh.faces) for mesh in pieces))
     seconds_left()
     for mesh in pieces:
-        mesh.vertices = mesh.vertices @ _axes(path).T
+        mesh.vertices = mesh.vertices @ content.axes.T
         own = {str(mesh.metadata.get(key)) for key in ("name", "node")}
         mesh.metadata["names"] = own | content.names_of(str(mesh.metadata.get("name")))
         mesh.metadata["notes"] = tuple(f"{path.name}: {note}" for note in dict.fromkeys(content.notes))
@@ -177,6 +179,7 @@ class _Content:
     def __init__(self, path: Path) -> None:
         self.path, self.type = path, path.suffix.lower()[1:]
         self.data = path.read_bytes()
+        self.axes = np.eye(3)  # axes and unit of the file to those of its meshes
         self.notes: list[str] = []  # what is not loaded
         self.names: dict[str, str] = {}  # names of the objects of the file, by the names that trimesh begins theirs with
 
@@ -188,7 +191,12 @@ class _Content:
         resolver = trimesh.resolvers.FilePathResolver(str(self.path))
         file = BytesIO(self.data)
         file.name = self.path.name
-        return trimesh.load_scene(file, file_type=self.type, resolver=resolver, process=False, **options)
+        try:
+            return trimesh.load_scene(file, file_type=self.type, resolver=resolver, process=False, **options)
+        except Exception as error:
+            if self.type != "dae" or not _drop_broken_materials(self, error):
+                raise
+            return self.load()
 
     def names_of(self, name: str) -> set[str]:
         """The names in the file of an object that trimesh calls ``name``."""
@@ -215,15 +223,13 @@ def cut_polygons(points: Array, corners: NDArray[np.int64], counts: NDArray[np.i
     cut: list[Any] = [np.zeros((0, 3), dtype=np.int64)] * len(counts)
     for count in np.unique(counts[counts >= 3]).tolist():
         chosen = np.flatnonzero(counts == count)
-        at = np.arange(1, count - 1)
-        fan = np.column_stack([np.zeros_like(at), at, at + 1])
         rings = points[corners[starts[chosen, None] + np.arange(count)]]  # (P, count, 3)
         edges = np.roll(rings, -1, axis=1) - rings
         turns = np.cross(np.roll(edges, 1, axis=1), edges)
         normals = np.cross(rings - rings[:, :1], np.roll(rings, -1, axis=1) - rings[:, :1]).sum(axis=1)
         bent = np.einsum("pki,pi->pk", turns, normals) <= 1e-9 * (normals**2).sum(axis=1)[:, None]
         for index, ring, normal, is_concave in zip(chosen, rings, normals, bent.any(axis=1), strict=True):
-            cut[index] = starts[index] + (_ears(ring, normal) if count > 3 and is_concave else fan)
+            cut[index] = starts[index] + (_ears(ring, normal) if count > 3 and is_concave else _fan_triangles(count))
     return cut
 
 
@@ -252,6 +258,7 @@ def _ears(ring: Array, normal: Array) -> NDArray[np.int64]:
     return np.array([*found, left])
 
 
+_EYE = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
 _KEYWORD = re.compile(r"[ \t]*(v|vt|vn|f|o|g|usemtl|mtllib|l|p|curv2?|surf)[ \t]+(.*)")
 
 
@@ -302,6 +309,112 @@ def _prepare_obj(content: _Content) -> None:
         if (content.path.parent / library).is_file():
             text = decode_text((content.path.parent / library).read_bytes())
             content.expect(re.findall(r"^\s*map_Kd\s+(.*?)\s*$", text, re.MULTILINE | re.IGNORECASE), "texture")
+
+
+_COLLADA_LIBRARIES = ("images", "effects", "materials", "geometries", "nodes", "visual_scenes")
+_POLYGONS = ("polylist", "polygons", "tristrips", "trifans")
+
+
+def _prepare_dae(content: _Content) -> None:
+    """Skins as meshes in their bind pose, polygons, strips and fans as triangles; cameras, lights and animations go."""
+    root = _parsed(content.data, content.path)
+    if (unit := root.find("asset/unit")) is not None:
+        content.axes = np.eye(3) * positive(unit.get("meter", "1"), 1, content.path, "unit of the asset")[0]
+    content.expect((i.removeprefix("file://") for i in _texts(root, "library_images/image//init_from")), "texture")
+    for geometry in root.iter("geometry"):
+        content.names[geometry.get("id", "")] = geometry.get("name", "")
+    sources = {controller.get("id"): controller for controller in root.iter("controller")}
+    for node in list(root.iter("node")):
+        for child in [child for child in node if child.tag.startswith("instance_")]:
+            if child.tag == "instance_controller":
+                skin = child
+                while (controller := sources.get((skin.get("url") or skin.get("source") or "")[1:])) is not None:
+                    skin = next(iter(controller))
+                    matrix = ElementTree.SubElement(node, "node")
+                    ElementTree.SubElement(matrix, "matrix").text = skin.findtext("bind_shape_matrix") or _EYE
+                    node.remove(child)
+                    node = matrix
+                    child.tag = "instance_geometry"
+                    child.set("url", skin.get("source", ""))
+                    node.append(child)
+                content.notes.append("its skin is shown in the pose in which it is bound")
+            elif child.tag not in ("instance_geometry", "instance_node"):
+                node.remove(child)
+    for library in [child for child in root if child.tag.startswith("library_")]:
+        if library.tag.removeprefix("library_") not in _COLLADA_LIBRARIES:
+            root.remove(library)
+    for mesh in root.iter("mesh"):
+        for element in [child for child in mesh if child.tag in ("lines", "linestrips", "triangles", *_POLYGONS)]:
+            if element.tag.startswith("line"):
+                content.notes.append("its lines are left out")
+            if element.tag.startswith("line") or not any(_texts(element, "p") + _texts(element, "ph/p")):
+                mesh.remove(element)
+            elif element.tag in _POLYGONS:
+                _cut_element(element, mesh)
+    content.data = ElementTree.tostring(root)
+
+
+def _texts(element: Element, path: str) -> list[str]:
+    return [(found.text or "").strip() for found in element.findall(path)]
+
+
+def _cut_element(element: Element, mesh: Element) -> None:
+    """Make <triangles> of the polygons, strips or fans of a COLLADA mesh."""
+    inputs = {i.get("semantic"): (int(i.get("offset", "0")), i.get("source", "")[1:]) for i in element.findall("input")}
+    width = max(offset for offset, _ in inputs.values()) + 1
+    runs = [np.array(text.split(), dtype=np.int64).reshape(-1, width) for text in _texts(element, ".//p")]
+    rows = np.concatenate(runs)
+    counts = np.array([len(run) for run in runs], dtype=np.int64)
+    if element.tag == "polylist":
+        counts = np.array((element.findtext("vcount") or "").split(), dtype=np.int64)
+    if element.tag in ("polylist", "polygons"):
+        sources = {child.get("id"): child for child in mesh}
+        offset, vertices = inputs["VERTEX"]
+        place = next(i for i in sources[vertices].findall("input") if i.get("semantic") == "POSITION")
+        source = sources[place.get("source", "")[1:]]
+        stride = int(source.find("technique_common/accessor").get("stride", "1"))  # type: ignore[union-attr]
+        points = np.array((source.findtext("float_array") or "").split(), dtype=np.float64).reshape(-1, stride)
+        triangles = np.concatenate(cut_polygons(points[:, :3], rows[:, offset], counts))
+    else:
+        at = _strip_triangles if element.tag == "tristrips" else _fan_triangles
+        triangles = np.concatenate([at(count) + start for count, start in zip(counts, np.cumsum(counts) - counts)])
+    for child in [child for child in element if child.tag in ("p", "ph", "vcount")]:
+        element.remove(child)
+    element.tag = "triangles"
+    element.set("count", str(len(triangles)))
+    ElementTree.SubElement(element, "p").text = " ".join(map(str, rows[triangles].ravel().tolist()))
+
+
+def _strip_triangles(count: int) -> NDArray[np.int64]:
+    at = np.arange(count - 2)
+    return np.column_stack([at, at + 1 + at % 2, at + 2 - at % 2])
+
+
+def _fan_triangles(count: int) -> NDArray[np.int64]:
+    at = np.arange(1, count - 1)
+    return np.column_stack([np.zeros_like(at), at, at + 1])
+
+
+def _drop_broken_materials(content: _Content, error: Exception) -> bool:
+    """Leave out what pycollada cannot read of the looks of a COLLADA file; False when there is nothing of that kind."""
+    import collada
+
+    read = collada.Collada(BytesIO(content.data), ignore=[collada.common.DaeError])
+    good = {f"{kind}#{item.id}" for kind in ("image", "effect", "material") for item in getattr(read, f"{kind}s")}
+    root, broken = _parsed(content.data, content.path), []
+    for parent in list(root.iter()):
+        for child in list(parent):
+            kind, name = child.tag, child.get("id", "")
+            if kind == "instance_material":
+                kind, name = "material", child.get("target", "")[1:]
+            if kind in ("image", "effect", "material") and f"{kind}#{name}" not in good and parent.tag != "extra":
+                broken.append(f"{kind} {name!r}")
+                parent.remove(child)
+    if broken:
+        reason = " ".join(str(error).split())
+        content.notes.append(f"{', '.join(dict.fromkeys(broken))} cannot be read ({reason}); drawn without")
+        content.data = ElementTree.tostring(root)
+    return bool(broken)
 
 
 def _prepare_off(content: _Content) -> None:
@@ -357,25 +470,188 @@ def _check_texture(mesh: Any, path: Path) -> None:
         )
 
 
-def _axes(path: Path) -> Array:
-    """(3, 3): axes and unit of the file to z up, for glTF, and metres, for COLLADA."""
-    if path.suffix.lower() in (".glb", ".gltf"):
-        return _Y_UP
-    unit = read_xml(path).find("asset/unit") if path.suffix.lower() == ".dae" else None
-    return np.eye(3) if unit is None else np.eye(3) * positive(unit.get("meter", "1"), 1, path, "unit of the asset")[0]
-
-
 def collada_axes(path: Path) -> Array:
     """(3, 3) rotation from the up axis that a COLLADA file names to z up. A URDF or SDF does not use it: RViz, Gazebo
     and PyBullet take the coordinates of its meshes as they are. Identity for other files.
     """
     if path.suffix.lower() != ".dae":
         return np.eye(3)
-    up = (read_xml(path).findtext("asset/up_axis") or "Y_UP").strip()
-    return {"X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "Z_UP": np.eye(3)}.get(up, _Y_UP)
+    found = re.search(rb"<(?:\w+:)?up_axis>\s*(\w+)", path.read_bytes())
+    turns = {b"X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), b"Z_UP": np.eye(3)}
+    return turns.get(found[1] if found else b"", _Y_UP)
 
 
-_PREPARED = {".obj": _prepare_obj, ".off": _prepare_off}
+_GLTF_NUMBERS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_GLTF_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_GLTF_DECODED = ("KHR_mesh_quantization", "EXT_mesh_gpu_instancing", "EXT_texture_webp")
+_GLTF_LOOKS = ("KHR_materials_", "KHR_lights_", "KHR_texture_", "KHR_xmp", "KHR_animation_", "ADOBE_materials_")
+
+
+class _Gltf:
+    """A glTF file on its way to trimesh, with what the specification allows and trimesh does not read made plain."""
+
+    def __init__(self, content: _Content) -> None:
+        self.path, self.binary = content.path, b""
+        text = content.data
+        if content.type == "glb":
+            if text[:4] != b"glTF" or len(text) < 20:
+                raise ValueError("it does not begin as a GLB")
+            length = int.from_bytes(text[12:16], "little")
+            text, self.binary = text[20 : 20 + length], text[28 + length :]
+        self.header: dict[str, Any] = json.loads(text)
+        self.buffers: dict[int, bytes] = {}
+        self.made = bytearray()
+        self.is_changed = False
+
+    def buffer(self, index: int) -> bytes:
+        """The bytes of a buffer."""
+        if index not in self.buffers:
+            uri = self.header["buffers"][index].get("uri")
+            if uri is None:
+                self.buffers[index] = self.binary
+            elif uri.startswith("data:"):
+                self.buffers[index] = base64.b64decode(uri.partition(",")[2])
+            else:
+                file = self.path.parent / unquote(uri)
+                if not file.is_file():
+                    raise InvalidInputError(f"{self.path} refers to the buffer {uri!r}, which is not in {file.parent}")
+                check_file(file)
+                self.buffers[index] = file.read_bytes()
+        return self.buffers[index]
+
+    def array(self, view: int, offset: int, kind: int, shape: tuple[int, int]) -> NDArray[Any]:
+        """Numbers (count, width) of a buffer view."""
+        where, dtype = self.header["bufferViews"][view], np.dtype(_GLTF_NUMBERS[kind])
+        stride = where.get("byteStride") or shape[1] * dtype.itemsize
+        start = where.get("byteOffset", 0) + offset
+        data = self.buffer(where["buffer"])
+        if start + (shape[0] - 1) * stride + shape[1] * dtype.itemsize > len(data):
+            raise ValueError(f"buffer view {view} reaches beyond the end of its buffer")
+        return np.ndarray(shape, dtype, data, start, (stride, dtype.itemsize)).copy()
+
+    def read(self, index: int) -> NDArray[Any]:
+        """The numbers (count, width) of an accessor; normalised integers become -1..1 or 0..1."""
+        found = self.header["accessors"][index]
+        shape = (found["count"], _GLTF_WIDTHS[found["type"]])
+        kind = found["componentType"]
+        values = np.zeros(shape, dtype=_GLTF_NUMBERS[kind])
+        if "bufferView" in found:
+            values = self.array(found["bufferView"], found.get("byteOffset", 0), kind, shape)
+        elif "sparse" not in found:
+            raise ValueError(f"accessor {index} has no data")
+        if sparse := found.get("sparse"):
+            at, new, count = sparse["indices"], sparse["values"], sparse["count"]
+            rows = self.array(at["bufferView"], at.get("byteOffset", 0), at["componentType"], (count, 1))[:, 0]
+            values[rows] = self.array(new["bufferView"], new.get("byteOffset", 0), kind, (count, shape[1]))
+        if found.get("normalized") and values.dtype.kind in "iu":
+            return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
+        return values
+
+    def add(self, values: NDArray[Any]) -> int:
+        """The index of a new accessor of these numbers (count, width)."""
+        kind = 5125 if values.dtype.kind in "iu" else 5126
+        data = values.astype(_GLTF_NUMBERS[kind]).tobytes()
+        views, accessors = self.header.setdefault("bufferViews", []), self.header["accessors"]
+        views.append({"buffer": len(self.header["buffers"]), "byteOffset": len(self.made), "byteLength": len(data)})
+        self.made += data
+        width = next(name for name, size in _GLTF_WIDTHS.items() if size == values.shape[1])
+        accessors.append(
+            {"bufferView": len(views) - 1, "componentType": kind, "count": len(values), "type": width}
+        )  # fmt: skip
+        self.is_changed = True
+        return len(accessors) - 1
+
+    def data(self) -> bytes:
+        """The file as JSON that holds its buffers."""
+        for index in range(len(self.header["buffers"])):
+            self.header["buffers"][index] = _data_uri(self.buffer(index))
+        self.header["buffers"].append(_data_uri(bytes(self.made)))
+        return json.dumps(self.header).encode()
+
+
+def _data_uri(data: bytes) -> dict[str, Any]:
+    text = base64.b64encode(data).decode()
+    return {"byteLength": len(data), "uri": f"data:application/octet-stream;base64,{text}"}
+
+
+def _prepare_gltf(content: _Content) -> None:
+    """Quantised, sparse and instanced geometry, strips and fans as plain triangles; a required extension that is not
+    known is refused by its name.
+    """
+    content.axes = _Y_UP
+    gltf = _Gltf(content)
+    header = gltf.header
+    required, used = set(header.get("extensionsRequired", ())), set(header.get("extensionsUsed", ()))
+    if unknown := sorted(n for n in required if n not in _GLTF_DECODED and not n.startswith(_GLTF_LOOKS)):
+        raise InvalidInputError(
+            f"{content.path} needs the glTF extension {', '.join(unknown)}, which is not read; export it without (a "
+            "compression such as Draco or meshopt is an option of the exporter)"
+        )
+    ignored = sorted(n for n in used - {"KHR_texture_transform"} if n not in _GLTF_DECODED and not n.startswith(_GLTF_LOOKS))
+    ignored += sorted(used & {"KHR_texture_transform", "KHR_texture_basisu"})
+    content.notes += [f"the glTF extension {name} is not applied" for name in ignored]
+    content.notes += ["its animations are not applied"] * ("animations" in header)
+    content.expect((i["uri"] for i in header.get("images", ()) if not i.get("uri", "data:").startswith("data:")), "texture")
+    for mesh in header.get("meshes", ()):
+        content.names[mesh.get("name", "GLTF")] = mesh.get("name", "GLTF")
+        if any(mesh.get("weights", ())) or any(node.get("weights") for node in header.get("nodes", ())):
+            content.notes.append("its morph targets are not applied")
+        for primitive in mesh["primitives"]:
+            _plain_primitive(primitive, gltf, content)
+    nodes = header.get("nodes", [])
+    if not header.get("scenes"):
+        children = {child for node in nodes for child in node.get("children", ())}
+        header["scenes"], gltf.is_changed = [{"nodes": [i for i in range(len(nodes)) if i not in children]}], True
+    for node in list(nodes):
+        gltf.is_changed |= node.pop("camera", None) is not None  # trimesh drops such a node with its mesh
+        if "skin" in node:
+            content.notes.append("its skin is shown without its joints, in the place of its node")
+        instances = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
+        if instances is None or "mesh" not in node:
+            continue
+        places = {key.lower(): gltf.read(index).tolist() for key, index in instances["attributes"].items()}
+        places = {key: places[key] for key in ("translation", "rotation", "scale") if key in places}
+        mesh = node.pop("mesh")
+        first = len(nodes)
+        nodes += [dict(zip(places, values, strict=True), mesh=mesh) for values in zip(*places.values(), strict=True)]
+        node["children"] = [*node.get("children", ()), *range(first, len(nodes))]
+        gltf.is_changed = True
+    reached, queue = set(), list(header["scenes"][header.get("scene", 0)].get("nodes", ()))
+    while queue:
+        if (index := queue.pop()) not in reached:
+            reached.add(index)
+            queue += nodes[index].get("children", ())
+    if apart := sum("mesh" in node for index, node in enumerate(nodes) if index not in reached):
+        content.notes.append(f"{apart} node(s) outside its scene are left out")
+    if gltf.is_changed:
+        content.data, content.type = gltf.data(), "gltf"
+
+
+def _plain_primitive(primitive: dict[str, Any], gltf: _Gltf, content: _Content) -> None:
+    """Make a primitive of floats and triangles of one that is not."""
+    accessors, attributes = gltf.header["accessors"], primitive["attributes"]
+    for where in [attributes["POSITION"], *([primitive["indices"]] if "indices" in primitive else [])]:
+        if "bufferView" not in accessors[where] and "sparse" not in accessors[where]:
+            names = ", ".join(primitive.get("extensions", ())) or "nothing"
+            raise InvalidInputError(
+                f"{content.path} holds a mesh without data, compressed by {names}, which is not read; export it without"
+            )
+    for key in ("POSITION", "NORMAL", "TEXCOORD_0"):
+        found = accessors[attributes[key]] if key in attributes else {"componentType": 5126}
+        if found["componentType"] != 5126 or "sparse" in found:
+            attributes[key] = gltf.add(gltf.read(attributes[key]).astype(np.float64))
+    mode = primitive.get("mode", 4)
+    if mode in (5, 6) or (mode == 4 and "sparse" in accessors[primitive.get("indices", attributes["POSITION"])]):
+        count = accessors[attributes["POSITION"]]["count"]
+        order = gltf.read(primitive["indices"])[:, 0] if "indices" in primitive else np.arange(count)
+        if mode != 4:
+            order = order[(_strip_triangles if mode == 5 else _fan_triangles)(len(order))]
+        primitive["indices"], primitive["mode"] = gltf.add(order.reshape(-1, 1)), 4
+
+
+_PREPARED = {
+    ".obj": _prepare_obj, ".off": _prepare_off, ".dae": _prepare_dae, ".glb": _prepare_gltf, ".gltf": _prepare_gltf
+}  # fmt: skip
 
 
 def bare(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -506,14 +782,20 @@ def read_xml(path: Path) -> Element:
     or is no XML, and as :func:`check_file` does.
     """
     check_file(path)
+    try:
+        return _parsed(path.read_bytes(), path)
+    except OSError as error:
+        raise CorruptFileError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def _parsed(data: bytes, path: Path) -> Element:
+    """The root element of the content of the XML file at ``path``."""
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
     parser.StartElementHandler, parser.CharacterDataHandler = builder.start, builder.data
     parser.EndElementHandler = builder.end
     try:
-        parser.Parse(_BEFORE_XML.sub(b"", path.read_bytes()), True)
+        parser.Parse(_BEFORE_XML.sub(b"", data), True)
         return builder.close()
-    except OSError as error:
-        raise CorruptFileError(f"{path} cannot be read: {error.strerror or error}") from error
     except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: its encoding
         raise CorruptFileError(f"{path} is not well-formed XML: {error}") from error
 
