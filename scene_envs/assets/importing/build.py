@@ -23,6 +23,7 @@ from scene_envs.assets.importing.mesh_files import (
     Model,
     Shape,
     collada_axes,
+    heavier,
     merged_inertial,
     pose_of,
 )
@@ -211,7 +212,7 @@ def weigh(
     """
 
     def even(mass: float) -> MassProperties:
-        return MassProperties(mass, solid.center_of_mass, solid.inertia * (mass / solid.mass))
+        return MassProperties(*dataclasses.astuple(heavier(solid, mass / solid.mass)))
 
     if density is not None:
         return Weight(even(density * solid.mass), (), ())
@@ -228,7 +229,8 @@ def weigh(
             text = f"mass and inertia recomputed at {DEFAULT_DENSITY:g} kg/m^3: {reason}"
             return Weight(even(DEFAULT_DENSITY * solid.mass), (), (text,))
         mass = given.mass
-    inertia, notes = given.inertia * (mass / given.mass), ()
+    inertia = given.inertia * (mass / given.mass)
+    notes: tuple[str, ...] = ()
     if not inertia.any():
         inertia, notes = even(mass).inertia, ("inertia computed from the shape: the file gives none",)
     wrong = why_impossible(inertia, given.center_of_mass, parts, even(mass))
@@ -353,6 +355,8 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
         notes += weight.notes
         warnings += weight.warnings
     visual = join(*(mesh for shape in model.visuals or shapes for mesh in visual_of(shape, entry.color)))
+    meshes = [shape for shape in (*model.visuals, *shapes) if shape.kind == "mesh"]
+    notes += dict.fromkeys(note for shape in meshes for mesh in meshes_of(shape) for note in mesh.metadata["notes"])
     shift = _shift(parts, entry, visual if static else None)
     apart = float(np.abs(np.asarray(visual.bounds) - bounds_of(parts)).max())
     if apart > max(_UNLIKE, 0.05 * size):

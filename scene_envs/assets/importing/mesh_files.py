@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 import re
+import struct
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from unittest.mock import patch
 from urllib.parse import unquote
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -108,6 +110,11 @@ def moved_inertial(pose: Array, inertial: Inertial) -> Inertial:
     return Inertial(inertial.mass, center, turn @ inertial.inertia @ turn.T)
 
 
+def heavier(inertial: Inertial, factor: float) -> Inertial:
+    """The inertial of the same body with ``factor`` times the density."""
+    return Inertial(inertial.mass * factor, inertial.center_of_mass, inertial.inertia * factor)
+
+
 def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
     """The inertial of several bodies joined to one: masses add, inertias by the parallel-axis theorem."""
     mass = sum(inertial.mass for inertial in inertials)
@@ -124,9 +131,10 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     """The triangle meshes of a file, in its axes and unit.
 
     Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned to z up; the unit
-    that a COLLADA file names is applied, its up axis is not (:func:`collada_axes`). Raises InvalidInputError (no such file, unknown format, beyond the
-    limits), CorruptFileError (unreadable, no triangles, not finite) and MissingDependencyError (COLLADA without
-    pycollada).
+    that a COLLADA file names is applied, its up axis is not (:func:`collada_axes`). The metadata of each mesh hold its
+    ``names`` in the file, and ``notes`` on what is not loaded. Raises InvalidInputError (no such file, unknown format,
+    beyond the limits), CorruptFileError (unreadable, no triangles, not finite) and MissingDependencyError (COLLADA
+    without pycollada).
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -181,7 +189,10 @@ class _Content:
         self.data = path.read_bytes()
         self.axes = np.eye(3)  # axes and unit of the file to those of its meshes
         self.notes: list[str] = []  # what is not loaded
-        self.names: dict[str, str] = {}  # names of the objects of the file, by the names that trimesh begins theirs with
+        self.scales: list[float] = []  # of the geometries, in the order of trimesh; 1 where there are fewer
+        self.names: dict[
+            str, str
+        ] = {}  # names of the objects of the file, by the names that trimesh begins theirs with
 
     def load(self) -> Any:
         """The scene that trimesh makes of the data."""
@@ -192,11 +203,15 @@ class _Content:
         file = BytesIO(self.data)
         file.name = self.path.name
         try:
-            return trimesh.load_scene(file, file_type=self.type, resolver=resolver, process=False, **options)
+            with _whole_polygons() if self.type == "dae" else nullcontext():
+                scene = trimesh.load_scene(file, file_type=self.type, resolver=resolver, process=False, **options)
         except Exception as error:
             if self.type != "dae" or not _drop_broken_materials(self, error):
                 raise
             return self.load()
+        for geometry, scale in zip(scene.geometry.values(), self.scales, strict=False):
+            geometry.vertices = geometry.vertices * scale
+        return scene
 
     def names_of(self, name: str) -> set[str]:
         """The names in the file of an object that trimesh calls ``name``."""
@@ -222,14 +237,15 @@ def cut_polygons(points: Array, corners: NDArray[np.int64], counts: NDArray[np.i
     starts = np.cumsum(counts) - counts
     cut: list[Any] = [np.zeros((0, 3), dtype=np.int64)] * len(counts)
     for count in np.unique(counts[counts >= 3]).tolist():
-        chosen = np.flatnonzero(counts == count)
+        chosen, at = np.flatnonzero(counts == count), np.arange(1, count - 1)
+        fan = np.column_stack([np.zeros_like(at), at, at + 1])
         rings = points[corners[starts[chosen, None] + np.arange(count)]]  # (P, count, 3)
         edges = np.roll(rings, -1, axis=1) - rings
         turns = np.cross(np.roll(edges, 1, axis=1), edges)
         normals = np.cross(rings - rings[:, :1], np.roll(rings, -1, axis=1) - rings[:, :1]).sum(axis=1)
         bent = np.einsum("pki,pi->pk", turns, normals) <= 1e-9 * (normals**2).sum(axis=1)[:, None]
         for index, ring, normal, is_concave in zip(chosen, rings, normals, bent.any(axis=1), strict=True):
-            cut[index] = starts[index] + (_ears(ring, normal) if count > 3 and is_concave else _fan_triangles(count))
+            cut[index] = starts[index] + (_ears(ring, normal) if count > 3 and is_concave else fan)
     return cut
 
 
@@ -286,6 +302,7 @@ def _prepare_obj(content: _Content) -> None:
             for corner in corners if "-" in rest else ():
                 for at, (word, size) in enumerate(zip(corner, sizes.values(), strict=False)):
                     corner[at] = str(size + 1 + int(word)) if word.startswith("-") else word
+            lines[number] = "f " + " ".join("/".join(corner) for corner in corners)
             polygons.append((number, corners))
         elif key == "mtllib":
             libraries.append(rest)
@@ -294,14 +311,13 @@ def _prepare_obj(content: _Content) -> None:
         elif key not in ("g", "usemtl"):
             content.notes.append("its points, lines and curves are left out")
     counts = np.array([len(corners) for _, corners in polygons], dtype=np.int64)
-    index = np.array([int(corner[0]) - 1 for _, corners in polygons for corner in corners], dtype=np.int64)
-    if (counts > 3).any() and 0 <= index.min() <= index.max() < len(points) and len({*map(len, points)}) == 1:
-        cut = cut_polygons(np.array(points), index, counts)
-    else:
-        cut = [np.arange(count).reshape(-1, 3) + start for count, start in zip(counts, np.cumsum(counts) - counts)]
-    words = ["/".join(corner) for _, corners in polygons for corner in corners]
-    for (number, _), triangles in zip(polygons, cut, strict=True):
-        lines[number] = "\n".join("f " + " ".join(words[at] for at in row) for row in triangles.tolist())
+    if (counts > 3).any() and {*map(len, points)} == {3}:
+        index = np.array([int(corner[0]) - 1 for _, corners in polygons for corner in corners], dtype=np.int64)
+        if index.min() < 0 or index.max() >= len(points):
+            raise CorruptFileError(f"{content.path}: a face refers to vertex {index.max() + 1} of {len(points)}")
+        words = ["/".join(corner) for _, corners in polygons for corner in corners]
+        for (number, _), triangles in zip(polygons, cut_polygons(np.array(points), index, counts), strict=True):
+            lines[number] = "\n".join("f " + " ".join(words[at] for at in row) for row in triangles.tolist())
     content.data = "\n".join(lines).encode()
     content.notes += [f"its second material file {name!r} is not read" for name in libraries[1:]]
     content.expect(libraries[:1], "material file")
@@ -312,87 +328,52 @@ def _prepare_obj(content: _Content) -> None:
 
 
 _COLLADA_LIBRARIES = ("images", "effects", "materials", "geometries", "nodes", "visual_scenes")
-_POLYGONS = ("polylist", "polygons", "tristrips", "trifans")
+_COLLADA_UNUSED = ("instance_camera", "instance_light", "instance_force_field")
 
 
 def _prepare_dae(content: _Content) -> None:
-    """Skins as meshes in their bind pose, polygons, strips and fans as triangles; cameras, lights and animations go."""
+    """Skins as meshes in the pose in which they are bound; cameras, lights, animations and lines left out."""
     root = _parsed(content.data, content.path)
     if (unit := root.find("asset/unit")) is not None:
         content.axes = np.eye(3) * positive(unit.get("meter", "1"), 1, content.path, "unit of the asset")[0]
-    content.expect((i.removeprefix("file://") for i in _texts(root, "library_images/image//init_from")), "texture")
-    for geometry in root.iter("geometry"):
-        content.names[geometry.get("id", "")] = geometry.get("name", "")
-    sources = {controller.get("id"): controller for controller in root.iter("controller")}
-    for node in list(root.iter("node")):
-        for child in [child for child in node if child.tag.startswith("instance_")]:
+    images = [(i.text or "").strip() for i in root.findall("library_images/image//init_from")]
+    content.expect([image.removeprefix("file://") for image in images], "texture")
+    content.names |= {geometry.get("id", ""): geometry.get("name", "") for geometry in root.iter("geometry")}
+    sources = {f"#{controller.get('id')}": controller[0] for controller in root.iter("controller") if len(controller)}
+    for parent in list(root.iter()):
+        for child in list(parent):
             if child.tag == "instance_controller":
-                skin = child
-                while (controller := sources.get((skin.get("url") or skin.get("source") or "")[1:])) is not None:
-                    skin = next(iter(controller))
-                    matrix = ElementTree.SubElement(node, "node")
-                    ElementTree.SubElement(matrix, "matrix").text = skin.findtext("bind_shape_matrix") or _EYE
-                    node.remove(child)
-                    node = matrix
-                    child.tag = "instance_geometry"
-                    child.set("url", skin.get("source", ""))
-                    node.append(child)
                 content.notes.append("its skin is shown in the pose in which it is bound")
-            elif child.tag not in ("instance_geometry", "instance_node"):
-                node.remove(child)
-    for library in [child for child in root if child.tag.startswith("library_")]:
-        if library.tag.removeprefix("library_") not in _COLLADA_LIBRARIES:
-            root.remove(library)
-    for mesh in root.iter("mesh"):
-        for element in [child for child in mesh if child.tag in ("lines", "linestrips", "triangles", *_POLYGONS)]:
-            if element.tag.startswith("line"):
-                content.notes.append("its lines are left out")
-            if element.tag.startswith("line") or not any(_texts(element, "p") + _texts(element, "ph/p")):
-                mesh.remove(element)
-            elif element.tag in _POLYGONS:
-                _cut_element(element, mesh)
+                parent.remove(child)
+                node, skin = parent, child
+                while (skin := sources.get(skin.get("url") or skin.get("source") or "")) is not None:  # type: ignore
+                    node = ElementTree.SubElement(node, "node")
+                    matrix = skin.findtext("bind_shape_matrix") or "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
+                    ElementTree.SubElement(node, "matrix").text = matrix
+                    child.tag, child.attrib = "instance_geometry", {"url": skin.get("source", "")}
+                node.append(child)
+            elif child.tag in ("lines", "linestrips", "ph"):
+                content.notes.append(f"its <{child.tag}> are left out")
+                parent.remove(child)
+            elif (
+                child.tag in _COLLADA_UNUSED or child.tag[:8] == "library_" and child.tag[8:] not in _COLLADA_LIBRARIES
+            ):
+                parent.remove(child)
     content.data = ElementTree.tostring(root)
 
 
-def _texts(element: Element, path: str) -> list[str]:
-    return [(found.text or "").strip() for found in element.findall(path)]
+@contextmanager
+def _whole_polygons() -> Iterator[None]:
+    """Context in which pycollada cuts concave polygons as :func:`cut_polygons` does, not as fans."""
+    from collada.polylist import Polylist
+    from collada.triangleset import TriangleSet
 
+    def triangleset(self: Any) -> Any:
+        cut = np.concatenate(cut_polygons(self.vertex, self.vertex_index, np.asarray(self.vcounts)))
+        return TriangleSet(self.sources, self.material, self.index[cut].ravel(), self.xmlnode)
 
-def _cut_element(element: Element, mesh: Element) -> None:
-    """Make <triangles> of the polygons, strips or fans of a COLLADA mesh."""
-    inputs = {i.get("semantic"): (int(i.get("offset", "0")), i.get("source", "")[1:]) for i in element.findall("input")}
-    width = max(offset for offset, _ in inputs.values()) + 1
-    runs = [np.array(text.split(), dtype=np.int64).reshape(-1, width) for text in _texts(element, ".//p")]
-    rows = np.concatenate(runs)
-    counts = np.array([len(run) for run in runs], dtype=np.int64)
-    if element.tag == "polylist":
-        counts = np.array((element.findtext("vcount") or "").split(), dtype=np.int64)
-    if element.tag in ("polylist", "polygons"):
-        sources = {child.get("id"): child for child in mesh}
-        offset, vertices = inputs["VERTEX"]
-        place = next(i for i in sources[vertices].findall("input") if i.get("semantic") == "POSITION")
-        source = sources[place.get("source", "")[1:]]
-        stride = int(source.find("technique_common/accessor").get("stride", "1"))  # type: ignore[union-attr]
-        points = np.array((source.findtext("float_array") or "").split(), dtype=np.float64).reshape(-1, stride)
-        triangles = np.concatenate(cut_polygons(points[:, :3], rows[:, offset], counts))
-    else:
-        at = _strip_triangles if element.tag == "tristrips" else _fan_triangles
-        triangles = np.concatenate([at(count) + start for count, start in zip(counts, np.cumsum(counts) - counts)])
-    for child in [child for child in element if child.tag in ("p", "ph", "vcount")]:
-        element.remove(child)
-    element.tag = "triangles"
-    element.set("count", str(len(triangles)))
-    ElementTree.SubElement(element, "p").text = " ".join(map(str, rows[triangles].ravel().tolist()))
-
-
-def _strip_triangles(count: int) -> NDArray[np.int64]:
-    at = np.arange(count - 2)
-    return np.column_stack([at, at + 1 + at % 2, at + 2 - at % 2])
-
-
-def _fan_triangles(count: int) -> NDArray[np.int64]:
-    at = np.arange(1, count - 1)
-    return np.column_stack([np.zeros_like(at), at, at + 1])
+    with patch.object(Polylist, "triangleset", triangleset):
+        yield
 
 
 def _drop_broken_materials(content: _Content, error: Exception) -> bool:
@@ -481,172 +462,63 @@ def collada_axes(path: Path) -> Array:
     return turns.get(found[1] if found else b"", _Y_UP)
 
 
-_GLTF_NUMBERS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_GLTF_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_GLTF_DECODED = ("KHR_mesh_quantization", "EXT_mesh_gpu_instancing", "EXT_texture_webp")
-_GLTF_LOOKS = ("KHR_materials_", "KHR_lights_", "KHR_texture_", "KHR_xmp", "KHR_animation_", "ADOBE_materials_")
-
-
-class _Gltf:
-    """A glTF file on its way to trimesh, with what the specification allows and trimesh does not read made plain."""
-
-    def __init__(self, content: _Content) -> None:
-        self.path, self.binary = content.path, b""
-        text = content.data
-        if content.type == "glb":
-            if text[:4] != b"glTF" or len(text) < 20:
-                raise ValueError("it does not begin as a GLB")
-            length = int.from_bytes(text[12:16], "little")
-            text, self.binary = text[20 : 20 + length], text[28 + length :]
-        self.header: dict[str, Any] = json.loads(text)
-        self.buffers: dict[int, bytes] = {}
-        self.made = bytearray()
-        self.is_changed = False
-
-    def buffer(self, index: int) -> bytes:
-        """The bytes of a buffer."""
-        if index not in self.buffers:
-            uri = self.header["buffers"][index].get("uri")
-            if uri is None:
-                self.buffers[index] = self.binary
-            elif uri.startswith("data:"):
-                self.buffers[index] = base64.b64decode(uri.partition(",")[2])
-            else:
-                file = self.path.parent / unquote(uri)
-                if not file.is_file():
-                    raise InvalidInputError(f"{self.path} refers to the buffer {uri!r}, which is not in {file.parent}")
-                check_file(file)
-                self.buffers[index] = file.read_bytes()
-        return self.buffers[index]
-
-    def array(self, view: int, offset: int, kind: int, shape: tuple[int, int]) -> NDArray[Any]:
-        """Numbers (count, width) of a buffer view."""
-        where, dtype = self.header["bufferViews"][view], np.dtype(_GLTF_NUMBERS[kind])
-        stride = where.get("byteStride") or shape[1] * dtype.itemsize
-        start = where.get("byteOffset", 0) + offset
-        data = self.buffer(where["buffer"])
-        if start + (shape[0] - 1) * stride + shape[1] * dtype.itemsize > len(data):
-            raise ValueError(f"buffer view {view} reaches beyond the end of its buffer")
-        return np.ndarray(shape, dtype, data, start, (stride, dtype.itemsize)).copy()
-
-    def read(self, index: int) -> NDArray[Any]:
-        """The numbers (count, width) of an accessor; normalised integers become -1..1 or 0..1."""
-        found = self.header["accessors"][index]
-        shape = (found["count"], _GLTF_WIDTHS[found["type"]])
-        kind = found["componentType"]
-        values = np.zeros(shape, dtype=_GLTF_NUMBERS[kind])
-        if "bufferView" in found:
-            values = self.array(found["bufferView"], found.get("byteOffset", 0), kind, shape)
-        elif "sparse" not in found:
-            raise ValueError(f"accessor {index} has no data")
-        if sparse := found.get("sparse"):
-            at, new, count = sparse["indices"], sparse["values"], sparse["count"]
-            rows = self.array(at["bufferView"], at.get("byteOffset", 0), at["componentType"], (count, 1))[:, 0]
-            values[rows] = self.array(new["bufferView"], new.get("byteOffset", 0), kind, (count, shape[1]))
-        if found.get("normalized") and values.dtype.kind in "iu":
-            return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
-        return values
-
-    def add(self, values: NDArray[Any]) -> int:
-        """The index of a new accessor of these numbers (count, width)."""
-        kind = 5125 if values.dtype.kind in "iu" else 5126
-        data = values.astype(_GLTF_NUMBERS[kind]).tobytes()
-        views, accessors = self.header.setdefault("bufferViews", []), self.header["accessors"]
-        views.append({"buffer": len(self.header["buffers"]), "byteOffset": len(self.made), "byteLength": len(data)})
-        self.made += data
-        width = next(name for name, size in _GLTF_WIDTHS.items() if size == values.shape[1])
-        accessors.append(
-            {"bufferView": len(views) - 1, "componentType": kind, "count": len(values), "type": width}
-        )  # fmt: skip
-        self.is_changed = True
-        return len(accessors) - 1
-
-    def data(self) -> bytes:
-        """The file as JSON that holds its buffers."""
-        for index in range(len(self.header["buffers"])):
-            self.header["buffers"][index] = _data_uri(self.buffer(index))
-        self.header["buffers"].append(_data_uri(bytes(self.made)))
-        return json.dumps(self.header).encode()
-
-
-def _data_uri(data: bytes) -> dict[str, Any]:
-    text = base64.b64encode(data).decode()
-    return {"byteLength": len(data), "uri": f"data:application/octet-stream;base64,{text}"}
+_GLTF_LOOKS = ("KHR_materials_", "KHR_lights_", "KHR_texture_", "EXT_texture_", "KHR_xmp", "KHR_mesh_quantization")
+"""Beginnings of the names of glTF extensions that leave the geometry as it is, or are read."""
+_GLTF_STEPS = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535}
+"""Integers that stand for 1, by their component type."""
 
 
 def _prepare_gltf(content: _Content) -> None:
-    """Quantised, sparse and instanced geometry, strips and fans as plain triangles; a required extension that is not
-    known is refused by its name.
-    """
+    """Scales of quantised positions, cameras left out; geometry that trimesh does not read is refused by its name."""
     content.axes = _Y_UP
-    gltf = _Gltf(content)
-    header = gltf.header
-    required, used = set(header.get("extensionsRequired", ())), set(header.get("extensionsUsed", ()))
-    if unknown := sorted(n for n in required if n not in _GLTF_DECODED and not n.startswith(_GLTF_LOOKS)):
+    text, rest = content.data, b""
+    if content.type == "glb":
+        size = int.from_bytes(content.data[12:16], "little")
+        text, rest = content.data[20 : 20 + size], content.data[20 + size :]
+    header = json.loads(text)
+    accessors, nodes = header.get("accessors", []), header.get("nodes", [])
+    primitives = [primitive for mesh in header.get("meshes", ()) for primitive in mesh["primitives"]]
+    lacking = [name for name in header.get("extensionsRequired", ()) if not name.startswith(_GLTF_LOOKS)]
+    lacking += [name for node in nodes for name in node.get("extensions", ()) if name == "EXT_mesh_gpu_instancing"]
+    lacking += ["triangle strips or fans" for primitive in primitives if primitive.get("mode", 4) in (5, 6)]
+    lacking += ["sparse accessors" for accessor in accessors if "sparse" in accessor]
+    for primitive in primitives:
+        position = accessors[primitive["attributes"]["POSITION"]]
+        if "bufferView" not in position and "sparse" not in position:
+            lacking += primitive.get("extensions") or ["meshes without data"]
+        step = _GLTF_STEPS[position["componentType"]] if position.get("normalized") else 1
+        content.scales += [1.0 / step] * (primitive.get("mode", 4) in (0, 1, 4))
+        for key in ("NORMAL", "TEXCOORD_0"):  # trimesh takes integers as they are
+            if key in primitive["attributes"] and accessors[primitive["attributes"][key]]["componentType"] != 5126:
+                del primitive["attributes"][key]
+                content.notes += ["its quantised texture coordinates are not read"] * (key != "NORMAL")
+    if lacking:
         raise InvalidInputError(
-            f"{content.path} needs the glTF extension {', '.join(unknown)}, which is not read; export it without (a "
-            "compression such as Draco or meshopt is an option of the exporter)"
+            f"{content.path} holds {', '.join(dict.fromkeys(lacking))}, which cannot be read; export it without "
+            "(compression and instancing are options of the exporter)"
         )
-    ignored = sorted(n for n in used - {"KHR_texture_transform"} if n not in _GLTF_DECODED and not n.startswith(_GLTF_LOOKS))
-    ignored += sorted(used & {"KHR_texture_transform", "KHR_texture_basisu"})
-    content.notes += [f"the glTF extension {name} is not applied" for name in ignored]
-    content.notes += ["its animations are not applied"] * ("animations" in header)
-    content.expect((i["uri"] for i in header.get("images", ()) if not i.get("uri", "data:").startswith("data:")), "texture")
-    for mesh in header.get("meshes", ()):
-        content.names[mesh.get("name", "GLTF")] = mesh.get("name", "GLTF")
-        if any(mesh.get("weights", ())) or any(node.get("weights") for node in header.get("nodes", ())):
-            content.notes.append("its morph targets are not applied")
-        for primitive in mesh["primitives"]:
-            _plain_primitive(primitive, gltf, content)
-    nodes = header.get("nodes", [])
-    if not header.get("scenes"):
-        children = {child for node in nodes for child in node.get("children", ())}
-        header["scenes"], gltf.is_changed = [{"nodes": [i for i in range(len(nodes)) if i not in children]}], True
-    for node in list(nodes):
-        gltf.is_changed |= node.pop("camera", None) is not None  # trimesh drops such a node with its mesh
-        if "skin" in node:
-            content.notes.append("its skin is shown without its joints, in the place of its node")
-        instances = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
-        if instances is None or "mesh" not in node:
-            continue
-        places = {key.lower(): gltf.read(index).tolist() for key, index in instances["attributes"].items()}
-        places = {key: places[key] for key in ("translation", "rotation", "scale") if key in places}
-        mesh = node.pop("mesh")
-        first = len(nodes)
-        nodes += [dict(zip(places, values, strict=True), mesh=mesh) for values in zip(*places.values(), strict=True)]
-        node["children"] = [*node.get("children", ()), *range(first, len(nodes))]
-        gltf.is_changed = True
-    reached, queue = set(), list(header["scenes"][header.get("scene", 0)].get("nodes", ()))
-    while queue:
-        if (index := queue.pop()) not in reached:
-            reached.add(index)
-            queue += nodes[index].get("children", ())
-    if apart := sum("mesh" in node for index, node in enumerate(nodes) if index not in reached):
+    used = {*header.get("extensionsUsed", ())}
+    ignored = [n for n in used if n in ("KHR_texture_transform", "KHR_texture_basisu") or not n.startswith(_GLTF_LOOKS)]
+    ignored += ["animations"] * ("animations" in header) + ["skins"] * any("skin" in node for node in nodes)
+    ignored += ["morph targets"] * any(any(some.get("weights", ())) for some in [*nodes, *header.get("meshes", ())])
+    content.notes += [f"its {name} is not applied" for name in sorted(ignored)]
+    content.expect(
+        [i["uri"] for i in header.get("images", ()) if not i.get("uri", "data:").startswith("data:")], "texture"
+    )
+    content.names |= {mesh["name"]: mesh["name"] for mesh in header.get("meshes", ()) if "name" in mesh}
+    for node in nodes:
+        node.pop("camera", None)  # trimesh leaves out the mesh of such a node, and the place of its children
+    children = {child for node in nodes for child in node.get("children", ())}
+    roots = [index for index in range(len(nodes)) if index not in children]
+    scenes = header.setdefault("scenes", [{"nodes": roots}])
+    if apart := len({*roots} - {*scenes[header.get("scene", 0)].get("nodes", ())}):
         content.notes.append(f"{apart} node(s) outside its scene are left out")
-    if gltf.is_changed:
-        content.data, content.type = gltf.data(), "gltf"
-
-
-def _plain_primitive(primitive: dict[str, Any], gltf: _Gltf, content: _Content) -> None:
-    """Make a primitive of floats and triangles of one that is not."""
-    accessors, attributes = gltf.header["accessors"], primitive["attributes"]
-    for where in [attributes["POSITION"], *([primitive["indices"]] if "indices" in primitive else [])]:
-        if "bufferView" not in accessors[where] and "sparse" not in accessors[where]:
-            names = ", ".join(primitive.get("extensions", ())) or "nothing"
-            raise InvalidInputError(
-                f"{content.path} holds a mesh without data, compressed by {names}, which is not read; export it without"
-            )
-    for key in ("POSITION", "NORMAL", "TEXCOORD_0"):
-        found = accessors[attributes[key]] if key in attributes else {"componentType": 5126}
-        if found["componentType"] != 5126 or "sparse" in found:
-            attributes[key] = gltf.add(gltf.read(attributes[key]).astype(np.float64))
-    mode = primitive.get("mode", 4)
-    if mode in (5, 6) or (mode == 4 and "sparse" in accessors[primitive.get("indices", attributes["POSITION"])]):
-        count = accessors[attributes["POSITION"]]["count"]
-        order = gltf.read(primitive["indices"])[:, 0] if "indices" in primitive else np.arange(count)
-        if mode != 4:
-            order = order[(_strip_triangles if mode == 5 else _fan_triangles)(len(order))]
-        primitive["indices"], primitive["mode"] = gltf.add(order.reshape(-1, 1)), 4
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    content.data = text
+    if content.type == "glb":
+        sizes = struct.pack("<III4s", 2, 20 + len(text) + len(rest), len(text), b"JSON")
+        content.data = b"glTF" + sizes + text + rest
 
 
 _PREPARED = {

@@ -19,6 +19,7 @@ from scene_envs.assets.importing.mesh_files import (
     color_of,
     find_mesh,
     from_roll_pitch_yaw,
+    heavier,
     merged_inertial,
     moved_inertial,
     numbers,
@@ -34,87 +35,66 @@ _ZERO = (0.0, 0.0, 0.0)
 _FREE = ("floating", "planar")
 """Types of joints that leave their child free."""
 _TO_WORLD = "a joint holds it at `world`: it is welded (`welded: false` makes it free)"
-_SHAPES = "mesh box cylinder sphere capsule"
 _MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+
+
+def _table(text: str) -> dict[str, list[str]]:
+    return {key.strip(): names.split() for key, names in (entry.split(": ") for entry in text.split(";"))}
+
+
 READ = {
-    "URDF": {
-        "robot": "link* joint* material*",
-        "link": "@name inertial visual* collision*",
-        "joint": "@name @type origin parent child",
-        "parent": "@link",
-        "child": "@link",
-        "origin": "@xyz @rpy @quat_xyzw",
-        "inertial": "origin mass inertia",
-        "mass": "@value",
-        "inertia": "@ixx @iyy @izz @ixy @ixz @iyz",
-        "visual": "origin geometry material",
-        "collision": "origin geometry",
-        "geometry": _SHAPES,
-        "mesh": "@filename @scale drake:declare_convex",
-        "box": "@size",
-        "cylinder": "@radius @length",
-        "capsule": "@radius @length",
-        "sphere": "@radius",
-        "material": "@name color",
-        "color": "@rgba",
-    },
-    "SDF": {
-        "sdf": "model* world*",
-        "world": "model* joint*",
-        "model": "@name link* joint* frame* static",
-        "link": "@name pose inertial visual* collision*",
-        "joint": "@name @type pose parent child",
-        "frame": "@name @attached_to pose",
-        "pose": "@relative_to @rotation_format @degrees",
-        "inertial": "@auto pose mass inertia density",
-        "inertia": " ".join(_MOMENTS),
-        "visual": "pose geometry material",
-        "collision": "pose geometry density material_density",
-        "geometry": f"{_SHAPES} ellipsoid plane empty",
-        "mesh": "@optimization uri scale submesh drake:declare_convex",
-        "submesh": "name center",
-        "box": "size",
-        "cylinder": "radius length",
-        "capsule": "radius length",
-        "sphere": "radius",
-        "ellipsoid": "radii",
-        "material": "diffuse",
-    },
+    "URDF": _table("""
+        robot: link* joint* material*; link: @name inertial visual* collision*; joint: @name @type origin parent child;
+        parent: @link; child: @link; origin: @xyz @rpy @quat_xyzw; inertial: origin mass inertia; mass: @value;
+        inertia: @ixx @iyy @izz @ixy @ixz @iyz; visual: origin geometry material; collision: origin geometry;
+        geometry: mesh box cylinder sphere capsule; mesh: @filename @scale drake:declare_convex; box: @size;
+        cylinder: @radius @length; capsule: @radius @length; sphere: @radius; material: @name color; color: @rgba
+    """),
+    "SDF": _table("""
+        sdf: model* world*; world: model* joint*; model: @name link* joint* frame* static;
+        link: @name pose inertial visual* collision*; joint: @name @type pose parent child;
+        frame: @name @attached_to pose; pose: @relative_to @rotation_format @degrees;
+        inertial: @auto pose mass inertia density; inertia: ixx iyy izz ixy ixz iyz; visual: pose geometry material;
+        collision: pose geometry density material_density;
+        geometry: mesh box cylinder sphere capsule ellipsoid plane empty;
+        mesh: @optimization uri scale submesh drake:declare_convex; submesh: name center; box: size;
+        cylinder: radius length; capsule: radius length; sphere: radius; ellipsoid: radii; material: diffuse
+    """),
 }
 """What is read of a file: children and @attributes of each element, those with a * any number of times."""
 IGNORED = {
-    "URDF": {
-        "names and versions change no body": "robot/@name robot/@version visual/@name collision/@name link/@type",
-        "joints are frozen at zero": "joint/axis joint/limit joint/dynamics joint/mimic joint/calibration "
-        "joint/safety_controller robot/transmission",
-        "it is output for debugging": "collision/verbose",
-    },
-    "SDF": {
-        "names and versions change no body": "sdf/@version world/@name visual/@name collision/@name model/@namespace "
-        "visual/meta",
-        "an asset has the frame of its model": "model/pose model/@canonical_link model/@placement_frame world/frame",
-        "joints are frozen at zero": "joint/axis joint/axis2 joint/physics joint/gearbox_ratio "
-        "joint/gearbox_reference_body joint/thread_pitch joint/screw_thread_pitch",
-        "a scene has its own world": "world/audio world/wind world/gravity world/magnetic_field world/atmosphere world/gui "
-        "world/physics world/scene world/light world/spherical_coordinates world/state",
-        "they are settings of a simulator": "model/self_collide model/allow_auto_disable model/enable_wind link/self_collide "
-        "link/enable_wind link/must_be_base_link link/velocity_decay collision/laser_retro collision/max_contacts "
-        "visual/laser_retro visual/cast_shadows visual/visibility_flags mesh/convex_decomposition",
-        "an asset has one colour and is opaque": "visual/transparency material/ambient material/specular "
-        "material/shininess material/emissive material/lighting material/render_order material/double_sided",
-        "planes are endless and left out": "plane/normal plane/size",
-    },
+    "URDF": _table("""
+        names change no body: robot/@name robot/@version visual/@name collision/@name link/@type;
+        joints are frozen at zero: joint/axis joint/limit joint/dynamics joint/mimic joint/calibration
+            joint/safety_controller robot/transmission;
+        it is output for debugging: collision/verbose
+    """),
+    "SDF": _table("""
+        names change no body: sdf/@version world/@name visual/@name collision/@name model/@namespace visual/meta;
+        an asset has the frame of its model: model/pose model/@canonical_link model/@placement_frame world/frame;
+        joints are frozen at zero: joint/axis joint/axis2 joint/physics joint/gearbox_ratio
+            joint/gearbox_reference_body joint/thread_pitch joint/screw_thread_pitch;
+        a scene has its own world: world/audio world/wind world/gravity world/magnetic_field world/atmosphere
+            world/gui world/physics world/scene world/light world/spherical_coordinates world/state;
+        they are settings of a simulator: model/self_collide model/allow_auto_disable model/enable_wind
+            link/self_collide link/enable_wind link/must_be_base_link link/velocity_decay collision/laser_retro
+            collision/max_contacts visual/laser_retro visual/cast_shadows visual/visibility_flags
+            mesh/convex_decomposition;
+        pictures show one opaque colour: visual/transparency material/ambient material/specular material/shininess
+            material/emissive material/lighting material/render_order material/double_sided;
+        planes are endless and left out: plane/normal plane/size
+    """),
 }
 """What is left out of a file on purpose, by reason. The report names everything else."""
 
 
 def _unread(root: Element, kind: str) -> tuple[str, ...]:
     """A note that names the elements and attributes that are neither read nor left out on purpose, if any."""
-    left_out = {name for names in IGNORED[kind].values() for name in names.split()}
+    left_out = {name for names in IGNORED[kind].values() for name in names}
     found: Counter[str] = Counter()
 
     def visit(element: Element) -> None:
-        read = READ[kind].get(element.tag, "").split()
+        read = READ[kind].get(element.tag, [])
         names = [f"@{key}" for key in element.attrib if key.partition(":")[0] != "xmlns"]
         for name, count in Counter([*names, *(child.tag for child in element)]).items():
             place = f"{element.tag}/{name}"
@@ -172,14 +152,12 @@ def read_sdf(path: Path) -> Model:
         inertial, where = link.find("inertial"), f"inertial of link {name!r}"
         if inertial is not None and _flag(inertial.get("auto")):
             default = _density(inertial, path, where) or 1000.0  # that of SDFormat
-            filled = [
-                Inertial(i.mass * density, i.center_of_mass, i.inertia * density)
-                for i, density in zip(map(solid_of, collisions[before:]), (d or default for d in densities), strict=True)
-            ]
+            solids = map(solid_of, collisions[before:])
+            filled = [heavier(i, density or default) for i, density in zip(solids, densities, strict=True)]
             if filled:
                 merged = merged_inertial(tuple(filled))
                 mass = numbers(inertial.findtext("mass"), 1, path, f"mass in {where}", (merged.mass,))[0]
-                inertials.append(Inertial(float(mass), merged.center_of_mass, merged.inertia * mass / merged.mass))
+                inertials.append(heavier(merged, float(mass) / merged.mass))
         elif inertial is not None:
             inertials.append(moved_inertial(pose, _sdf_inertial(inertial, path, where)))
     joints = [*model.findall("joint"), *root.findall("world/joint")]
@@ -285,8 +263,8 @@ def _geometry(element: Element, path: Path, where: str) -> Element:
 
 def _is_point(element: Element, sizes: Iterable[str | None]) -> bool:
     """Whether a visual has a size of 0, which other readers take as well; sizes of collisions are above 0."""
-    words = " ".join(size or "" for size in sizes).replace(",", " ").split()
-    return element.tag == "visual" and any(word.strip("+0.") in ("", "e") for word in words)
+    words = " ".join(size or "" for size in sizes).split()
+    return element.tag == "visual" and any(not word.strip("+-0.,") for word in words)
 
 
 def _sdf_shape(element: Element, pose: Array, path: Path, where: str) -> Shape | str:
@@ -436,7 +414,9 @@ def _own_color(material: Element, path: Path) -> Color | None:
     return None if element is None else color_of(element.get("rgba"), path, f"material {material.get('name')!r}")
 
 
-def _urdf_shape(element: Element, link: Array, materials: dict[str, Color | None], path: Path, where: str) -> Shape | str:
+def _urdf_shape(
+    element: Element, link: Array, materials: dict[str, Color | None], path: Path, where: str
+) -> Shape | str:
     """The shape of a visual or collision, or why it is none."""
     pose = link @ _origin(element, path, where)
     material = element.find("material")

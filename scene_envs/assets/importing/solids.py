@@ -205,7 +205,9 @@ def _oriented(pieces: Sequence[trimesh.Trimesh]) -> list[trimesh.Trimesh]:
     from trimesh.repair import fix_winding
 
     bodies = sorted((p for p in pieces if p.is_watertight), key=lambda piece: -abs(piece.volume))
-    signs, is_full, kept = [], [], []
+    signs: list[bool] = []
+    is_full: list[bool] = []
+    kept = []
     for body in bodies:
         if not body.is_winding_consistent:
             fix_winding(body)
@@ -236,7 +238,8 @@ def _filled(bodies: Sequence[trimesh.Trimesh]) -> Inertial:
     """The solid of closed bodies and cavities at 1 kg/m^3."""
     import trimesh
 
-    solid: Any = trimesh.util.concatenate(list(bodies)).mass_properties
+    joined: Any = trimesh.util.concatenate(list(bodies))
+    solid = joined.mass_properties
     return Inertial(float(solid.volume), np.asarray(solid.center_mass), np.asarray(solid.inertia))
 
 
@@ -465,9 +468,9 @@ def _surfaces(shape: Shape) -> list[trimesh.Trimesh]:
 
     apart = [bare(mesh) for mesh in meshes_of(shape)]
     if len(apart) > 1 and not all(mesh.is_watertight for mesh in apart):
-        joined = bare(trimesh.util.concatenate([trimesh.Trimesh(m.vertices, m.faces, process=False) for m in apart]))
-        if joined.is_watertight:
-            return [joined]
+        joined: Any = trimesh.util.concatenate(apart)
+        if (whole := bare(joined)).is_watertight:
+            return [whole]
     return apart
 
 
