@@ -327,8 +327,7 @@ def _prepare_obj(content: _Content) -> None:
             content.expect(re.findall(r"^\s*map_Kd\s+(.*?)\s*$", text, re.MULTILINE | re.IGNORECASE), "texture")
 
 
-_COLLADA_LIBRARIES = ("images", "effects", "materials", "geometries", "nodes", "visual_scenes")
-_COLLADA_UNUSED = ("instance_camera", "instance_light", "instance_force_field")
+_COLLADA_UNUSED = ("camera", "light", "force_field", "cameras", "lights", "animations", "controllers")
 
 
 def _prepare_dae(content: _Content) -> None:
@@ -355,9 +354,7 @@ def _prepare_dae(content: _Content) -> None:
             elif child.tag in ("lines", "linestrips", "ph"):
                 content.notes.append(f"its <{child.tag}> are left out")
                 parent.remove(child)
-            elif (
-                child.tag in _COLLADA_UNUSED or child.tag[:8] == "library_" and child.tag[8:] not in _COLLADA_LIBRARIES
-            ):
+            elif child.tag.removeprefix("instance_").removeprefix("library_") in _COLLADA_UNUSED:
                 parent.remove(child)
     content.data = ElementTree.tostring(root)
 

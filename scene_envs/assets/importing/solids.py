@@ -211,7 +211,7 @@ def _oriented(pieces: Sequence[trimesh.Trimesh]) -> list[trimesh.Trimesh]:
     for body in bodies:
         if not body.is_winding_consistent:
             fix_winding(body)
-        signs.append(body.volume > 0)
+        signs.append(bool(body.volume > 0))
         around = [index for index in range(len(is_full)) if _holds(bodies[index], body)]
         turned = not around or signs[around[-1]] != signs[-1]
         is_full.append(turned != (bool(around) and is_full[around[-1]]))
