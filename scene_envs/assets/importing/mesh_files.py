@@ -336,6 +336,8 @@ def _prepare_dae(content: _Content) -> None:
     if (unit := root.find("asset/unit")) is not None:
         content.axes = np.eye(3) * positive(unit.get("meter", "1"), 1, content.path, "unit of the asset")[0]
     images = [(i.text or "").strip() for i in root.findall("library_images/image//init_from")]
+    known = {i.get(key) for key, tag in (("id", "image"), ("sid", "newparam")) for i in root.iter(tag)}
+    images += [i.get("texture", "") for i in root.iter("texture") if i.get("texture") not in known]
     content.expect([image.removeprefix("file://") for image in images], "texture")
     content.names |= {geometry.get("id", ""): geometry.get("name", "") for geometry in root.iter("geometry")}
     sources = {f"#{controller.get('id')}": controller[0] for controller in root.iter("controller") if len(controller)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -102,6 +103,8 @@ def _unread(root: Element, kind: str) -> tuple[str, ...]:
                 found[place] += count
             elif name in read and count > 1:
                 found[f"second {place}"] += count - 1
+        if element.tag == "geometry" and len(element) > 1:
+            found["second geometry"] += 1
         for child in element:
             if child.tag in read or f"{child.tag}*" in read:
                 visit(child)
@@ -161,6 +164,9 @@ def read_sdf(path: Path) -> Model:
         elif inertial is not None:
             inertials.append(moved_inertial(pose, _sdf_inertial(inertial, path, where)))
     joints = [*model.findall("joint"), *root.findall("world/joint")]
+    for joint, end in product(model.findall("joint"), ("parent", "child")):
+        if (name := (joint.findtext(end) or "").strip()) != "world" and not frames.has(name):
+            raise CorruptFileError(f"{path}: joint {joint.get('name')!r} connects {name!r}, which does not exist")
     movable = [j.get("name", "?") for j in joints if j.get("type") != "fixed"]
     if movable:
         notes.append(f"movable joints frozen at zero: {', '.join(movable)}")
@@ -212,6 +218,10 @@ class _Frames:
             self._elements.setdefault(joint.get("name", ""), (joint, (joint.findtext("child") or "").strip()))
         for frame in model.findall("frame"):
             self._elements.setdefault(frame.get("name", ""), (frame, frame.get("attached_to") or "__model__"))
+
+    def has(self, name: str) -> bool:
+        """Whether there is a frame called ``name``."""
+        return name == "__model__" or name in self._elements
 
     def pose(self, name: str, waiting: tuple[str, ...] = ()) -> Array:
         """(4, 4) of the frame called ``name``."""
