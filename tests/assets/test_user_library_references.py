@@ -509,7 +509,7 @@ def test_quaternions_turn_as_angles_do(tmp_path: Path) -> None:
     angles = (0.3, -0.4, 1.2)
     quaternion = " ".join(map(str, Rotation.from_euler("xyz", angles).as_quat() * 2))
     rpy = " ".join(map(str, angles))
-    text = '<robot name="r"><link name="l"><collision><origin {}/><geometry><box size="0.2 0.1 0.04"/></geometry></collision></link></robot>'
+    text = urdf('<box size="0.2 0.1 0.04"/>').replace("<collision>", "<collision><origin {}/>")
     by_angles = listed(tmp_path, "it.urdf", text.format(f'rpy="{rpy}"'))
     by_quaternion = listed(tmp_path, "it.urdf", text.format(f'quat_xyzw="{quaternion}"'))
     assert by_quaternion.bounds == pytest.approx(by_angles.bounds, abs=1e-12)
@@ -540,7 +540,8 @@ def test_what_hangs_on_the_world_is_welded(
     """Drake counts 6 more velocities for a free body than for one that a joint holds."""
     first = f'<link name="{parent}"/>' if declared or parent != "world" else ""
     text = (
-        f'<robot name="r">{first}<link name="board">{WEIGHT}</link><joint name="j" type="{kind}"><parent link="{parent}"/>'
+        f'<robot name="r">{first}<link name="board">{WEIGHT}</link>'
+        f'<joint name="j" type="{kind}"><parent link="{parent}"/>'
         '<child link="board"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
     )
     asset = listed(tmp_path, "it.urdf", text)
@@ -688,8 +689,8 @@ ellipsoid: radii
 plane: normal size
 material: script shader lighting render_order ambient diffuse specular shininess emissive double_sided pbr""",
 }
-"""Elements and attributes of urdf.xsd of urdfdom and of the descriptions of SDFormat 1.12, but for those inside elements
-that are left out as a whole; <heightmap>, <image>, <polyline> and <cone> are refused."""
+"""Elements and attributes of urdf.xsd of urdfdom and of the descriptions of SDFormat 1.12, but for those inside
+elements that are left out as a whole; <heightmap>, <image>, <polyline> and <cone> are refused."""
 
 
 def schema(kind: str) -> list[tuple[str, str]]:

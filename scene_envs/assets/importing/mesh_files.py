@@ -190,9 +190,7 @@ class _Content:
         self.axes = np.eye(3)  # axes and unit of the file to those of its meshes
         self.notes: list[str] = []  # what is not loaded
         self.scales: list[float] = []  # of the geometries, in the order of trimesh; 1 where there are fewer
-        self.names: dict[
-            str, str
-        ] = {}  # names of the objects of the file, by the names that trimesh begins theirs with
+        self.names: dict[str, str] = {}  # of the objects of the file, by what trimesh begins their names with
 
     def load(self) -> Any:
         """The scene that trimesh makes of the data."""
@@ -275,56 +273,54 @@ def _ears(ring: Array, normal: Array) -> NDArray[np.int64]:
 
 
 _EYE = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
-_KEYWORD = re.compile(r"[ \t]*(v|vt|vn|f|o|g|usemtl|mtllib|l|p|curv2?|surf)[ \t]+(.*)")
-
-
 def _prepare_obj(content: _Content) -> None:
     """Polygons cut into triangles, relative indices made absolute, and what is not loaded."""
     from trimesh.util import decode_text
 
-    lines = decode_text(content.data).replace("\\\r\n", " ").replace("\\\n", " ").splitlines()
+    text = decode_text(content.data).replace("\r\n", "\n").replace("\\\n", " ")
+    if re.search(r"^[ \t]+\S|^[a-z]+\t", text, re.MULTILINE):
+        text = re.sub(r"^[ \t]*([a-z]\w*)[ \t]+", r"\1 ", text, flags=re.MULTILINE)
+    content.names |= {name: name for name in re.findall(r"^o (.+?)\s*$", text, re.MULTILINE)}
+    libraries = re.findall(r"^mtllib (.+?)\s*$", text, re.MULTILINE)
+    content.expect(libraries[:1], "material file")
+    content.notes += [f"its second material file {name!r} is not read" for name in libraries[1:]]
+    for library in [content.path.parent / name for name in libraries[:1]]:
+        materials = decode_text(library.read_bytes()) if library.is_file() else ""
+        content.expect(re.findall(r"^\s*map_Kd\s+(.+?)\s*$", materials, re.MULTILINE | re.IGNORECASE), "texture")
+    if re.search(r"^(?:l|p|curv2?|surf) ", text, re.MULTILINE):
+        content.notes.append("its points, lines and curves are left out")
+    if re.search(r"^f(?: +[^\s#]+){4}|^f[^\n]*[ /]-", text, re.MULTILINE):
+        text = _cut_faces(text.split("\n"), content.path)
+    content.data = text.encode()
+
+
+def _cut_faces(lines: list[str], path: Path) -> str:
+    """The text of an OBJ with triangles for its polygons."""
     points: list[list[float]] = []
-    polygons: list[tuple[int, list[list[str]]]] = []  # line, and the words of each corner
-    libraries: list[str] = []
+    faces: dict[int, list[str]] = {}  # corners by line
     sizes = {"v": 0, "vt": 0, "vn": 0}
     for number, line in enumerate(lines):
-        match = _KEYWORD.match(line)
-        if match is None:
-            continue
-        key, rest = match[1], match[2].strip()
-        lines[number] = f"{key} {rest}"
+        key, _, rest = line.partition(" ")
         if key in sizes:
             sizes[key] += 1
             if key == "v":
                 points.append([float(word) for word in rest.split()[:3]])
         elif key == "f":
-            corners = [word.split("/") for word in rest.partition("#")[0].split()]
-            for corner in corners if "-" in rest else ():
-                for at, (word, size) in enumerate(zip(corner, sizes.values(), strict=False)):
-                    corner[at] = str(size + 1 + int(word)) if word.startswith("-") else word
-            lines[number] = "f " + " ".join("/".join(corner) for corner in corners)
-            polygons.append((number, corners))
-        elif key == "mtllib":
-            libraries.append(rest)
-        elif key == "o":
-            content.names[rest] = rest
-        elif key not in ("g", "usemtl"):
-            content.notes.append("its points, lines and curves are left out")
-    counts = np.array([len(corners) for _, corners in polygons], dtype=np.int64)
-    if (counts > 3).any() and {*map(len, points)} == {3}:
-        index = np.array([int(corner[0]) - 1 for _, corners in polygons for corner in corners], dtype=np.int64)
-        if index.min() < 0 or index.max() >= len(points):
-            raise CorruptFileError(f"{content.path}: a face refers to vertex {index.max() + 1} of {len(points)}")
-        words = ["/".join(corner) for _, corners in polygons for corner in corners]
-        for (number, _), triangles in zip(polygons, cut_polygons(np.array(points), index, counts), strict=True):
-            lines[number] = "\n".join("f " + " ".join(words[at] for at in row) for row in triangles.tolist())
-    content.data = "\n".join(lines).encode()
-    content.notes += [f"its second material file {name!r} is not read" for name in libraries[1:]]
-    content.expect(libraries[:1], "material file")
-    for library in libraries[:1]:
-        if (content.path.parent / library).is_file():
-            text = decode_text((content.path.parent / library).read_bytes())
-            content.expect(re.findall(r"^\s*map_Kd\s+(.*?)\s*$", text, re.MULTILINE | re.IGNORECASE), "texture")
+            faces[number] = rest.partition("#")[0].split()
+            if "-" in rest:  # a relative index counts back from here
+                split = [zip(corner.split("/"), sizes.values(), strict=False) for corner in faces[number]]
+                faces[number] = [
+                    "/".join(str(size + 1 + int(word)) if word[:1] == "-" else word for word, size in corner)
+                    for corner in split
+                ]
+    words = [corner for corners in faces.values() for corner in corners]
+    index = np.array([int(word.partition("/")[0]) - 1 for word in words], dtype=np.int64)
+    if index.min() < 0 or index.max() >= len(points):
+        raise CorruptFileError(f"{path}: a face refers to vertex {index.max() + 1} of {len(points)}")
+    counts = np.array([len(corners) for corners in faces.values()], dtype=np.int64)
+    for number, triangles in zip(faces, cut_polygons(np.array(points), index, counts), strict=True):
+        lines[number] = "\n".join("f " + " ".join(words[at] for at in row) for row in triangles.tolist())
+    return "\n".join(lines)
 
 
 _COLLADA_UNUSED = ("camera", "light", "force_field", "cameras", "lights", "animations", "controllers")
