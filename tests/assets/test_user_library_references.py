@@ -417,6 +417,15 @@ def test_a_ball_in_a_cavity_counts_and_mixed_faces_are_turned(tmp_path: Path) ->
     assert np.diag(asset.inertia) == pytest.approx(box_moments(BOX, 500), rel=1e-4)
 
 
+def test_plates_apart_are_one_body(tmp_path: Path) -> None:
+    """Two plates without thickness span a volume together, and no body is closed."""
+    plate = trimesh.Trimesh([(0, 0, 0), (0.1, 0, 0), (0.1, 0.1, 0), (0, 0.1, 0)], [(0, 1, 2), (0, 2, 3)])
+    whole = plate + at(plate, 0, 0, 0.05)
+    asset = listed(tmp_path, "it.stl", whole.export(file_type="stl"), ", decomposition: convex")
+    assert asset.mass == pytest.approx(500 * 0.1 * 0.1 * 0.05, rel=1e-5)
+    assert len(listed(tmp_path, "it.stl", whole.export(file_type="stl")).fine) == 1
+
+
 def test_a_body_that_is_split_by_material_is_whole(tmp_path: Path) -> None:
     points, polygons = channel(U_SHAPE)
     faces = ["f " + " ".join(str(i + 1) for i in polygon) for polygon in polygons]

@@ -272,7 +272,6 @@ def _ears(ring: Array, normal: Array) -> NDArray[np.int64]:
     return np.array([*found, left])
 
 
-_EYE = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
 def _prepare_obj(content: _Content) -> None:
     """Polygons cut into triangles, relative indices made absolute, and what is not loaded."""
     from trimesh.util import decode_text

@@ -167,7 +167,7 @@ def convex_parts(
     bodies = [body for body in closed if body.volume > 0] if is_closed else thick
     if method == "convex":
         parts, bodies = [_hull(surface.vertices, tolerance)], []
-    elif len(bodies) > _MAX_BODIES or any(
+    elif not 0 < len(bodies) <= _MAX_BODIES or any(
         not piece.is_watertight and _depth(piece, _hull(piece.vertices, tolerance)) > tolerance for piece in bodies
     ):
         bodies = [surface]
@@ -205,27 +205,30 @@ def _oriented(pieces: Sequence[trimesh.Trimesh]) -> list[trimesh.Trimesh]:
     from trimesh.repair import fix_winding
 
     bodies = sorted((p for p in pieces if p.is_watertight), key=lambda piece: -abs(piece.volume))
+    if not bodies:
+        return []
+    lows, highs = (np.array([body.bounds[end] for body in bodies]) for end in (0, 1))
     signs: list[bool] = []
     is_full: list[bool] = []
     kept = []
-    for body in bodies:
+    for at, body in enumerate(bodies):
+        seconds_left()
         if not body.is_winding_consistent:
             fix_winding(body)
         signs.append(bool(body.volume > 0))
-        around = [index for index in range(len(is_full)) if _holds(bodies[index], body)]
-        turned = not around or signs[around[-1]] != signs[-1]
-        is_full.append(turned != (bool(around) and is_full[around[-1]]))
+        near = np.flatnonzero(((lows[:at] <= lows[at]) & (highs[:at] >= highs[at])).all(axis=1)).tolist()
+        around = next((index for index in reversed(near) if _holds(bodies[index], body)), None)
+        turned = around is None or signs[around] != signs[at]
+        is_full.append(turned != (around is not None and is_full[around]))
         if turned:
-            kept.append(body if signs[-1] == is_full[-1] else body.copy())
-            if signs[-1] != is_full[-1]:
+            kept.append(body if signs[at] == is_full[at] else body.copy())
+            if signs[at] != is_full[at]:
                 kept[-1].invert()
     return kept
 
 
 def _holds(outer: trimesh.Trimesh, inner: trimesh.Trimesh) -> bool:
     """Whether a closed body encloses four corners of another, by their solid angles (van Oosterom and Strackee)."""
-    if (outer.bounds[0] > inner.bounds[0]).any() or (outer.bounds[1] < inner.bounds[1]).any():
-        return False
     points = np.asarray(inner.vertices)[:: max(1, len(inner.vertices) // 4)][:4]
     a, b, c = np.moveaxis(np.asarray(outer.triangles)[None] - points[:, None, None], 2, 0)  # each (P, F, 3)
     la, lb, lc = (np.linalg.norm(corner, axis=-1) for corner in (a, b, c))
