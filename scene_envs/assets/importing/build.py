@@ -347,8 +347,6 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     if entry.welded is None and (entry.mass is not None or entry.density is not None):
         static = False
     given = merged_inertial(model.inertials) if model.inertials else None
-    if given is not None and not any(inertial.inertia.any() for inertial in model.inertials):
-        given = dataclasses.replace(given, inertia=np.zeros((3, 3)))
     weight = weigh(given, parts, solid, entry.mass, entry.density)
     properties = mass_properties(parts, 0.0) if static else weight.properties
     if not static:

@@ -341,8 +341,8 @@ def _prepare_dae(content: _Content) -> None:
             if child.tag == "instance_controller":
                 content.notes.append("its skin is shown in the pose in which it is bound")
                 parent.remove(child)
-                node, skin = parent, child
-                while (skin := sources.get(skin.get("url") or skin.get("source") or "")) is not None:  # type: ignore
+                node, skin, left = parent, child, dict(sources)
+                while (skin := left.pop(skin.get("url") or skin.get("source") or "", None)) is not None:  # type: ignore
                     node = ElementTree.SubElement(node, "node")
                     matrix = skin.findtext("bind_shape_matrix") or "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
                     ElementTree.SubElement(node, "matrix").text = matrix

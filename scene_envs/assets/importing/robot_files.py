@@ -165,8 +165,8 @@ def read_sdf(path: Path) -> Model:
             inertials.append(moved_inertial(pose, _sdf_inertial(inertial, path, where)))
     joints = [*model.findall("joint"), *root.findall("world/joint")]
     for joint, end in product(model.findall("joint"), ("parent", "child")):
-        if (name := (joint.findtext(end) or "").strip()) != "world" and not frames.has(name):
-            raise CorruptFileError(f"{path}: joint {joint.get('name')!r} connects {name!r}, which does not exist")
+        if (name := (joint.findtext(end) or "").strip()) != "world":
+            frames.pose(name)
     movable = [j.get("name", "?") for j in joints if j.get("type") != "fixed"]
     if movable:
         notes.append(f"movable joints frozen at zero: {', '.join(movable)}")
@@ -219,16 +219,12 @@ class _Frames:
         for frame in model.findall("frame"):
             self._elements.setdefault(frame.get("name", ""), (frame, frame.get("attached_to") or "__model__"))
 
-    def has(self, name: str) -> bool:
-        """Whether there is a frame called ``name``."""
-        return name == "__model__" or name in self._elements
-
     def pose(self, name: str, waiting: tuple[str, ...] = ()) -> Array:
         """(4, 4) of the frame called ``name``."""
         if name in ("__model__", ""):
             return np.eye(4)
         if name not in self._elements:
-            raise CorruptFileError(f"{self._path}: a pose is relative to {name!r}, which does not exist")
+            raise CorruptFileError(f"{self._path}: a pose or a joint refers to {name!r}, which does not exist")
         if name in waiting:
             raise CorruptFileError(f"{self._path}: the poses of {', '.join(map(repr, waiting))} refer to each other")
         element, default = self._elements[name]
