@@ -242,8 +242,11 @@ def cut_polygons(points: Array, corners: NDArray[np.int64], counts: NDArray[np.i
         turns = np.cross(np.roll(edges, 1, axis=1), edges)
         normals = np.cross(rings - rings[:, :1], np.roll(rings, -1, axis=1) - rings[:, :1]).sum(axis=1)
         bent = np.einsum("pki,pi->pk", turns, normals) <= 1e-9 * (normals**2).sum(axis=1)[:, None]
-        for index, ring, normal, is_concave in zip(chosen, rings, normals, bent.any(axis=1), strict=True):
-            cut[index] = starts[index] + (_ears(ring, normal) if count > 3 and is_concave else fan)
+        rows = starts[chosen, None, None] + fan
+        for index in np.flatnonzero(bent.any(axis=1)) if count > 3 else ():
+            rows[index] = starts[chosen[index]] + _ears(rings[index], normals[index])
+        for index, triangles in zip(chosen, rows, strict=True):
+            cut[index] = triangles
     return cut
 
 
