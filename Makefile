@@ -1,5 +1,6 @@
 # make demo      steer the shipped prior and write runs/demo/report.html
 # make test      run the tests; JOBS=8 for more processes, SEED=1 for one order, ARGS="-m 'not slow'" for pytest
+# make test-gpu   run the tests of CUDA on a GPU; DEVICE=cpu tries them without one
 # make test-docs  run the code of every page and notebook
 # make lint      check style, formatting and types
 # make docs      build the documentation into site/index.html
@@ -16,9 +17,10 @@ ENV := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=
 INSTALL := .venv/bin/python .ci/install.py -c constraints.txt
 
 PYTEST := $(ENV) .venv/bin/python -m pytest --randomly-seed=$(SEED) -n $(JOBS) --dist worksteal
+DEVICE ?= cuda
 PAGES := tests/docs/test_pages.py tests/integration/test_notebooks.py
 
-.PHONY: demo test test-docs lint docs check install install-dev clean help
+.PHONY: demo test test-gpu test-docs lint docs check install install-dev clean help
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -28,6 +30,9 @@ demo: install
 
 test: install-dev
 	$(PYTEST) --doctest-modules $(PAGES:%=--ignore=%) scene_envs rewards agents configs tests $(ARGS)
+
+test-gpu: install-dev
+	SCENE_ENVS_TEST_DEVICE=$(DEVICE) $(ENV) .venv/bin/python -m pytest -m gpu -p no:randomly tests/gpu $(ARGS)
 
 test-docs: install-dev
 	$(PYTEST) $(PAGES) $(ARGS)

@@ -19,6 +19,10 @@ os.environ.setdefault("RAY_worker_niceness", "0")  # at 15, Ray's default, its w
 _TESTS, _MEMORY = Path(__file__).parent / "tests", "/dev/shm"
 if "TMPDIR" not in os.environ and os.path.isdir(_MEMORY) and shutil.disk_usage(_MEMORY).free > 4 * 2**30:
     os.environ["TMPDIR"], tempfile.tempdir = _MEMORY, None  # files of tests wait for no disk
+if "PYTEST_XDIST_WORKER" not in os.environ:  # its workers have the same folder
+    os.environ["SCENE_ENVS_CACHE"] = (_CACHE := tempfile.TemporaryDirectory(prefix="scene_envs_cache")).name
+if "SCENE_ENVS_TEST_DEVICE" not in os.environ:
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""  # numbers of tests are those of a CPU; `make test-gpu` compares
 gc.disable()  # what collection imports is kept: the search of it for garbage costs seconds
 
 

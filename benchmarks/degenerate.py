@@ -1,13 +1,14 @@
 """Time of physics, rewards and search on degenerate scenes, such as all objects at one point, in pairs or nested.
 
-    python benchmarks/degenerate.py [TYPE ...] [--count 2] [--seed 0] [--one-asset]
+    python benchmarks/degenerate.py [TYPE ...] [--count 2] [--seed 0] [--one-asset] [--physics auto]
 
 The scenes are the heaps of ``projection.py --heaps``, in which random assets take all slots of a type. Two kinds are
 added: four pairs of objects, in each of which a corner of the upper object stands on a corner of the lower one, and a
-scene with a NaN. *search* is the evaluation of a root with the objective `feasible_objects`. Each row is printed as
-soon as it is known, with the CPU time of the slowest of ``--count`` scenes; at the end follows the largest time of each
-function. A star: the scene was refused with an error of this package, or its row is invalid. An exclamation mark: the
-result is not finite.
+scene with a NaN. The prompt of rewards is written for an ordinary scene of the type, on which every function must give
+a result. *search* is the evaluation of a root with the objective `feasible_objects`. Each row is printed as soon as it
+is known, with the CPU time of the slowest of ``--count`` scenes; at the end follows the largest time of each function.
+A star: the scene was refused with an error of this package, or its row is invalid. An exclamation mark: the result is
+not finite.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import argparse
 import logging
 import time
 from collections.abc import Callable
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -23,11 +25,12 @@ import torch
 from projection import HEAPS, heap
 from scipy.spatial.transform import Rotation
 
-from rewards import Reward, RewardOutput, evaluate_reward, make_reward
+from rewards import Reward, RewardContext, RewardOutput, evaluate_reward, make_reward
 from rewards.feasible import forget_verdicts
+from scene_envs.datasets.prompts import describe
 from scene_envs.errors import SceneEnvsError
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import equilibrium, feasibility, make_ready, penetration, project, settle
+from scene_envs.physics import equilibrium, feasibility, make_pool, make_ready, penetration, project, settle
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import list_scene_types
 
@@ -36,16 +39,11 @@ Function = Callable[[SceneBatch], object]
 REWARDS = {
     "object_count": make_reward("object_count"),
     "feasible_objects": make_reward("feasible_objects"),
-    "prompt_match": make_reward("prompt_match", prompt="A scene with two cups on a table."),
+    "prompt_match": make_reward("prompt_match"),
     "clip": make_reward("clip", reward="feasible_objects", high=3.0),
     "product": make_reward("product", rewards=["object_count", "feasible_objects"]),
-    **{
-        name: make_reward(name)
-        for name in ("feasible_share", "clutter", "stability", "reachability", "coverage", "diversity")
-    },
+    **{name: make_reward(name) for name in ("feasible_share", "clutter", "stability", "reachability", "diversity")},
     "penetration (reward)": make_reward("penetration"),
-    "category_count": make_reward("category_count", assets=["teacup"]),
-    "relation": make_reward("relation", prompt="A scene with two cups on a table."),
     "realism": make_reward("realism"),
     "weighted_sum": make_reward("weighted_sum", rewards=["object_count", "feasible_objects"], weights=[1.0, 1.0]),
 }
@@ -109,10 +107,16 @@ def seconds(function: Function, batch: SceneBatch) -> tuple[float, str]:
     return spent, "" if bool(torch.isfinite(answer).all()) else "!"
 
 
-def scored(reward: Reward, batch: SceneBatch) -> RewardOutput:
-    """The output of a reward, computed without verdicts from earlier calls."""
+def scored(batch: SceneBatch, reward: Reward, context: RewardContext) -> RewardOutput:
+    """The output of a reward, computed without verdicts from earlier calls.
+
+    Raises:
+        RewardError: the reward failed.
+    """
     forget_verdicts()
-    return evaluate_reward(reward, batch)
+    if reward.name == "diversity":  # compares scenes of a batch
+        batch = batch[[0, 0]]
+    return evaluate_reward(reward, batch, context, strict=True)
 
 
 def main() -> None:
@@ -121,21 +125,29 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=2, help="scenes per type and kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--one-asset", action="store_true", help="all of the asset with most convex parts")
+    parser.add_argument("--physics", default="auto", help="engine")
     options = parser.parse_args()
     torch.set_num_threads(1)
     logging.disable(logging.WARNING)
-    names = [*PHYSICS, *REWARDS, "search"]
+    names = [*PHYSICS, *REWARDS, "category_count", "search"]
     print(" | ".join(("scene type", "kind", *names)), flush=True)
     largest = dict.fromkeys(names, (0.0, ""))
     for name in options.types or list_scene_types():
-        env = gym.make("scene_envs:SceneEnvs/Search-v0", scene=name, objective="feasible_objects", num_steps=2)
-        functions = PHYSICS | {
-            key: lambda batch, reward=reward: scored(reward, batch) for key, reward in REWARDS.items()
-        }
-        functions["search"] = lambda batch, env=env: env.reset(seed=0, options={"scene": batch})
+        env = gym.make(
+            "scene_envs:SceneEnvs/Search-v0", scene=name, objective="feasible_objects", num_steps=2,
+            physics=options.physics,
+        )  # fmt: skip
         clean = get_grammar(name).sample(np.random.default_rng(options.seed), 1)
-        for function in (*PHYSICS.values(), functions["search"]):
-            function(clean)  # builds what is needed
+        (prompt,) = describe(clean, np.random.default_rng(options.seed), kinds=["relations"])
+        first = clean.scene_type.assets[int(clean.categories[clean.is_free][0])]
+        rewards = REWARDS | {"category_count": make_reward("category_count", assets=[first])}
+        context = RewardContext((prompt,), make_pool(0, physics=options.physics))
+        functions = {key: partial(function, physics=options.physics) for key, function in PHYSICS.items()}
+        functions |= {key: partial(scored, reward=reward, context=context) for key, reward in rewards.items()}
+        functions["search"] = lambda batch, env=env: env.reset(seed=0, options={"scene": batch})
+        for key, function in functions.items():  # builds what is needed
+            if seconds(function, clean)[1]:
+                raise SystemExit(f"{key} gives no result on an ordinary scene of {name}, so its time measures nothing")
         for kind in (*HEAPS, "corners", "NaN"):
             rng = np.random.default_rng(options.seed)
             batches = [degenerate(name, kind, rng, one_asset=options.one_asset) for _ in range(options.count)]

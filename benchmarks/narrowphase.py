@@ -298,14 +298,13 @@ def sample(count: int, seed: int) -> tuple[list[Array], PlacedParts, list[str]]:
 
 
 def measured(overlaps: Overlaps, placed: PlacedParts, first: Index, second: Index) -> Array:
-    """Depths (P,) m of the pairs of rows ``first`` (P,) and ``second`` (P,), one by one; 0 where they do not overlap.
-    ``overlaps`` has one body for each part.
+    """Depths (P,) m of the pairs of rows ``first`` (P,) and ``second`` (P,), each a scene of its own; 0 where they do
+    not overlap. ``overlaps`` has one body for each part.
     """
-    depth = np.zeros(len(first))
-    for pair, rows in enumerate(np.stack([first, second], axis=1)):
-        found = overlaps(placed.part[rows], placed.rotation[rows], placed.translation[rows])
-        assert found is not None
-        depth[pair] = found[2].sum()
+    rows, pair, depth = np.concatenate([first, second]), np.arange(len(first)), np.zeros(len(first))
+    poses = placed.part[rows], placed.rotation[rows], placed.translation[rows]
+    one, _, found, _ = overlaps(*poses, pair, pair + len(pair), np.tile(pair, 2))
+    depth[one] = found
     return depth
 
 

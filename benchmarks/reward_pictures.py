@@ -67,7 +67,6 @@ def trained_discriminator() -> LearnedReward:
 
 
 FRUIT = {"name": "category_count", "assets": "fruit"}
-STEAMERS = {"name": "relation", "prompt": "A scene where two steamer lids are each on top of a steamer bottom."}
 NAMED = {"name": "prompt_match", "prompt": "A scene with a table, two cups and four plates."}
 PICTURES = {
     "object_count": Picture("object_count", "breakfast_table_high_clutter"),
@@ -79,11 +78,9 @@ PICTURES = {
     "feasible_share": Picture("feasible_share", "breakfast_table_high_clutter", 0.003, "not feasible", without_credit),
     "stability": Picture("stability", "dimsum_table", 0.008, "moves", without_credit),
     "category_count": Picture(FRUIT, "pantry_shelf", 0.0, "fruit", credited),
-    "relation": Picture(STEAMERS, "dimsum_table", 0.0, "spoken of", credited),
     "prompt_match": Picture(NAMED, "dimsum_table"),
     "reachability": Picture("reachability", "dimsum_table", 0.0, "not reached", without_credit),
     "clearance": Picture("clearance", "dimsum_table", 0.01, "crowded", lambda b, o: o.object_flags["crowded"]),
-    "coverage": Picture("coverage", "pantry_shelf"),
     "diversity": Picture("diversity", "breakfast_table_low_clutter"),
     "realism": Picture("realism", "dimsum_table", 0.01),
     "discriminator": Picture(trained_discriminator, "dimsum_table", 0.01, "probability below 0.5", without_credit),

@@ -83,7 +83,7 @@ class Neon(Algorithm):
 
     def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """One optimiser step of the copy; the prior gets no gradient."""
-        x0 = self.own.encode(finished_scenes(batch).to(self.own.device))
+        x0 = self.own.encode(finished_scenes(batch))
         loss = self.own.noised_loss(self.own.noised(x0, generator), text_of(batch[:, -1])).mean()
         loss.backward()
         clip_grad_norm_(self.parameters, 1.0)

@@ -19,12 +19,12 @@ from rewards.clearance import Clearance
 from rewards.clutter import Clutter
 from rewards.composite import Clip, Gate, Product, WeightedSum
 from rewards.counts import CategoryCount, ObjectCount
-from rewards.diversity import Coverage, Diversity
+from rewards.diversity import Diversity
 from rewards.evaluation import evaluate_reward
 from rewards.feasible import FeasibleObjects, FeasibleShare, Stability
 from rewards.penetration import Penetration
 from rewards.process import IsolatedReward
-from rewards.prompt_match import PromptMatch, Relation
+from rewards.prompt_match import PromptMatch
 from rewards.reachability import Reachability
 from rewards.realism import Realism
 from rewards.registry import (
@@ -45,7 +45,6 @@ __all__ = [
     "Clearance",
     "Clip",
     "Clutter",
-    "Coverage",
     "Diversity",
     "FeasibleObjects",
     "FeasibleShare",
@@ -58,7 +57,6 @@ __all__ = [
     "PromptMatch",
     "Reachability",
     "Realism",
-    "Relation",
     "Reward",
     "RewardContext",
     "RewardInfo",

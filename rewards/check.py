@@ -27,13 +27,9 @@ Check = Callable[["_Subject"], None]
 def check_reward(
     reward: Any, scene_type: str | SceneType = "dimsum_table", *, context: RewardContext | None = None, seed: int = 0
 ) -> list[str]:
-    """Check a reward against everything that training and search rely on.
+    """Check a reward (a name, mapping, function, class or reward) against everything that training and search rely on.
 
-    Args:
-        reward: a name, mapping, function, class or reward.
-        scene_type: scene type of the test scenes.
-        context: context for the reward; by default a prompt per scene and no worker pool.
-        seed: seed of the test scenes.
+    The test scenes are drawn from ``seed``; by default the context has a prompt per scene and no worker pool.
 
     Returns:
         One sentence per checked clause. Scenes alone and in a batch are not compared if the reward declares
@@ -162,7 +158,8 @@ def _require_equal(expected: RewardOutput, found: RewardOutput, what: str) -> No
     if not torch.equal(expected.is_valid, found.is_valid):
         raise RewardError(f"On {what}, valid is {found.is_valid.tolist()} instead of {expected.is_valid.tolist()}")
     valid = expected.is_valid
-    if not _close(expected.value[valid], found.value[valid]):
+    value, other = expected.value[valid], found.value[valid]
+    if not bool(((value - other).abs() <= TOLERANCE * value.abs().clamp(min=1.0)).all()):
         raise RewardError(f"On {what}, the values are {_short(found.value)} instead of {_short(expected.value)}")
     if (expected.per_object is None) != (found.per_object is None):
         raise RewardError(f"On {what}, per_object is given once and missing once; always give it, or never")
@@ -170,10 +167,6 @@ def _require_equal(expected: RewardOutput, found: RewardOutput, what: str) -> No
         gap = (expected.per_object - found.per_object)[valid].abs()
         if gap.numel() and not float(gap.max()) <= TOLERANCE * max(1.0, float(expected.per_object[valid].abs().max())):
             raise RewardError(f"On {what}, per_object differs by up to {float(gap.max()):.4g}")
-
-
-def _close(a: Tensor, b: Tensor) -> bool:
-    return bool(((a - b).abs() <= TOLERANCE * a.abs().clamp(min=1.0)).all())
 
 
 def _short(values: Tensor) -> str:

@@ -22,7 +22,7 @@ from rewards.base import (
     counts_objects,
     declared_maximum,
     depends_on_batch,
-    parts_of,
+    facts_of,
 )
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
@@ -30,33 +30,8 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
 
-class _Composite:
-    """A reward that depends on its batch if a part does."""
-
-    @property
-    def depends_on_batch(self) -> bool:
-        """Whether a part depends on the batch."""
-        return depends_on_batch(*parts_of(self))
-
-
-class _Changed(_Composite):
-    """A composite that is of the kind of its part ``reward``."""
-
-    reward: Any
-
-    @property
-    def averages_objects(self) -> bool:
-        """Whether ``reward`` is a mean over the objects."""
-        return averages_objects(self.reward)
-
-    @property
-    def counts_objects(self) -> bool:
-        """Whether ``reward`` depends on which objects there are."""
-        return counts_objects(self.reward)
-
-
 @register_reward("weighted_sum")
-class WeightedSum(_Composite):
+class WeightedSum:
     """Sum of rewards, each times its weight.
 
     ``per_object`` is the weighted sum of the parts' credits when all of them give one. If some parts are means over the
@@ -81,11 +56,11 @@ class WeightedSum(_Composite):
         if len(self.weights) != len(self.rewards):
             raise InvalidInputError(f"weighted_sum: {len(self.rewards)} rewards need as many weights, got {weights!r}")
         self.offset = float(offset)
+        self.depends_on_batch = depends_on_batch(*self.rewards)
         self.averages_objects = averages_objects(*self.rewards)
         self.counts_objects = counts_objects(*self.rewards)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Score every part and add up."""
         outputs = _score_parts(self.rewards, batch, context)
         pairs = zip(self.rewards, outputs.values(), strict=True)
         credits = [self._credit(reward, output, batch) for reward, output in pairs if output.per_object is not None]
@@ -113,11 +88,8 @@ class WeightedSum(_Composite):
 
 
 @register_reward("product")
-class Product(_Composite):
+class Product:
     """Product of rewards; 0 if one of them is 0.
-
-    Args:
-        rewards: parts of the reward.
 
     >>> Product(["object_count"])(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
     tensor([1.])
@@ -127,9 +99,9 @@ class Product(_Composite):
 
     def __init__(self, rewards: Sequence[Any]) -> None:
         self.rewards = _resolve_parts(self.name, rewards)
+        self.depends_on_batch = depends_on_batch(*self.rewards)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Score every part and multiply."""
         outputs = _score_parts(self.rewards, batch, context)
         return _combine(torch.stack([output.value for output in outputs.values()]).prod(dim=0), outputs)
 
@@ -139,7 +111,7 @@ class Product(_Composite):
 
 @register_reward("gate")
 @dataclass(frozen=True)
-class Gate(_Changed):
+class Gate:
     """A reward that counts only where another one reaches a threshold.
 
     Attributes:
@@ -160,8 +132,9 @@ class Gate(_Changed):
     otherwise: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "reward", resolve_reward(self.reward))
-        object.__setattr__(self, "condition", resolve_reward(self.condition))
+        parts = {"reward": resolve_reward(self.reward), "condition": resolve_reward(self.condition)}
+        vars(self).update(parts, **facts_of(parts["reward"]))
+        vars(self)["depends_on_batch"] = depends_on_batch(*parts.values())
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score both; credit per object is that of ``reward`` where the gate is open, else 0."""
@@ -175,7 +148,7 @@ class Gate(_Changed):
 
 @register_reward("clip")
 @dataclass(frozen=True)
-class Clip(_Changed):
+class Clip:
     """A reward kept between two bounds.
 
     Attributes:
@@ -193,7 +166,8 @@ class Clip(_Changed):
     high: float | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "reward", resolve_reward(self.reward))
+        reward = resolve_reward(self.reward)
+        vars(self).update(facts_of(reward), reward=reward)
         if self.low is None and self.high is None:
             raise InvalidInputError("clip: give low, high or both")
         if self.low is not None and self.high is not None and self.low > self.high:

@@ -29,7 +29,6 @@ class ObjectCount:
     counts_objects: ClassVar[bool] = True
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value: every slot holds an object."""
         return slots
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
@@ -62,7 +61,6 @@ class CategoryCount:
         object.__setattr__(self, "assets", names)
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value: every slot holds an object that counts."""
         return slots
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:

@@ -23,6 +23,7 @@ from rewards.base import RewardContext, RewardOutput, declared_maximum, facts_of
 from rewards.registry import as_output, is_own, resolve_reward, reward_name
 from scene_envs.errors import MissingDependencyError, RewardError
 from scene_envs.protocols import SceneScorer
+from scene_envs.registry import describe_error, error_text
 from scene_envs.scene import SceneBatch
 
 logger = logging.getLogger(__name__)
@@ -30,8 +31,6 @@ logger = logging.getLogger(__name__)
 _local = threading.local()
 _warned: set[tuple[int, str]] = set()
 _MAX_WARNINGS = 256
-_MAX_TEXT = 300
-"""Number of characters of a foreign error that a message repeats."""
 
 
 @contextmanager
@@ -133,7 +132,7 @@ def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardO
         raise
     except SystemExit as error:
         raise RewardError(
-            f"reward {name!r} called sys.exit({_text(error)}){_place(error.__traceback__)}; raise an error instead"
+            f"reward {name!r} called sys.exit({error_text(error)}){_place(error.__traceback__)}; raise an error instead"
         ) from error
     except BaseException as error:
         if own and isinstance(error, MissingDependencyError):
@@ -145,25 +144,6 @@ def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardO
     if batch.tensor._version != version or not (own or torch.equal(given.tensor, batch.tensor)):
         raise RewardError(f"reward {name!r} changed the scenes it was given; work on a clone of batch.tensor")
     return _checked(name, output, batch)
-
-
-def describe_error(error: BaseException) -> str:
-    """Type and text of an error of foreign code, of bounded length.
-
-    >>> describe_error(ValueError("no")), len(describe_error(ValueError("x" * 10**6))) < 400
-    ('ValueError: no', True)
-    """
-    text = _text(error)
-    name = type.__dict__["__name__"].__get__(type(error))  # a metaclass may override ``__name__``
-    return f"{name}: {text}" if text else str(name)
-
-
-def _text(error: BaseException) -> str:
-    try:
-        text = str(error)
-    except BaseException:
-        return "(its text cannot be read)"
-    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}... ({len(text)} characters)"
 
 
 def _place(trace: TracebackType | None) -> str:

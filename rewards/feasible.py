@@ -77,6 +77,12 @@ def _keys(batch: SceneBatch, limits: dict[str, float]) -> list[bytes]:
     return [hashlib.blake2b(scene.tobytes() + common, digest_size=16).digest() for scene in scenes]
 
 
+def _require_positive(reward: FeasibleObjects | Stability, *settings: str) -> None:
+    for setting in settings:
+        if not getattr(reward, setting) > 0:
+            raise InvalidInputError(f"{reward.name}: {setting}={getattr(reward, setting)} must be positive")
+
+
 @register_reward("feasible_objects")
 @dataclass(frozen=True)
 class FeasibleObjects:
@@ -100,12 +106,9 @@ class FeasibleObjects:
     duration: float = 0.1
 
     def __post_init__(self) -> None:
-        for setting in _LIMITS:
-            if not getattr(self, setting) > 0:
-                raise InvalidInputError(f"{self.name}: {setting}={getattr(self, setting)} must be positive")
+        _require_positive(self, *_LIMITS)
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value: every free slot holds a feasible object."""
         return free_slots
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
@@ -140,19 +143,12 @@ class FeasibleShare(FeasibleObjects):
     Definition and settings are those of ``feasible_objects``. A scene without free objects scores 0, so that emptying a
     scene gains nothing. Generated welded objects, such as the tables of rooms, do not change the value. They get credit
     for not overlapping each other.
-
-    Attributes:
-        max_penetration: deepest allowed overlap with any other object, m.
-        max_displacement: largest allowed movement, m.
-        max_rotation: largest allowed rotation, rad.
-        duration: simulated time, s.
     """
 
     name: ClassVar[str] = "feasible_share"
     averages_objects: ClassVar[bool] = True
 
     def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value, of scenes with only feasible objects."""
         return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
@@ -205,9 +201,7 @@ class Stability:
     duration: float = 0.1
 
     def __post_init__(self) -> None:
-        for setting in ("scale", "scale_rotation", "max_penetration", "duration"):
-            if not getattr(self, setting) > 0:
-                raise InvalidInputError(f"stability: {setting}={getattr(self, setting)} must be positive")
+        _require_positive(self, "scale", "scale_rotation", "max_penetration", "duration")
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Simulate; rows that physics could not judge are invalid.

@@ -5,14 +5,15 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 
 from rewards.base import RewardContext, RewardOutput, declared_maximum, facts_of, learned_parts
-from rewards.evaluation import current_draw, describe_error, evaluate_reward, other_draw, seeded_generators
+from rewards.evaluation import current_draw, evaluate_reward, other_draw, seeded_generators
 from rewards.registry import (
     RewardInfo,
     allow_local_rewards,
@@ -29,11 +30,41 @@ from rewards.registry import (
     reward_info,
     reward_name,
 )
+from scene_envs.envs.settings import takes
 from scene_envs.errors import InvalidInputError, RewardError, RewardTimeoutError, SceneEnvsError, UnknownNameError
 from scene_envs.physics import PhysicsPool, make_pool
+from scene_envs.registry import describe_error
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type, register_scene_type
 from scene_envs.workers import START_UP, Process, WorkerFailure
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessSettings:
+    """Settings of a reward that runs in a worker process.
+
+    Attributes:
+        timeout: seconds that a call may take, and that making the reward may take.
+        memory: GiB that it may allocate beyond what an empty worker needs (on Linux; elsewhere unlimited).
+        seed: seed of the run, for rewards that draw random numbers.
+        workers: physics workers of a reward that asks for ``context.pool``; 0 computes in its process.
+        physics: engine of that pool.
+
+    Raises:
+        InvalidInputError: a limit is no positive number.
+    """
+
+    timeout: float = 60.0
+    memory: float = 1.0
+    seed: int = 0
+    workers: int = 0
+    physics: str = "auto"
+
+    def __post_init__(self) -> None:
+        for name in ("timeout", "memory"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < float("inf"):
+                raise InvalidInputError(f"{name}={value!r} must be a positive number")
 
 
 class IsolatedReward:
@@ -45,11 +76,7 @@ class IsolatedReward:
 
     Args:
         reward: a registered name, ``PATH.py:NAME`` or a mapping; objects cannot be sent.
-        timeout: seconds that a call may take, and that making the reward may take.
-        memory: GiB that it may allocate beyond what an empty worker needs (on Linux; elsewhere unlimited).
-        seed: seed of the run, for rewards that draw random numbers.
-        workers: physics workers of a reward that asks for ``context.pool``; 0 computes in its process.
-        physics: engine of that pool.
+        **settings: fields of :class:`ProcessSettings`.
 
     Raises:
         InvalidInputError: ``reward`` is no valid reward, or a limit is no positive number.
@@ -60,22 +87,12 @@ class IsolatedReward:
     tensor([1., 1.])
     """
 
-    def __init__(
-        self,
-        reward: Any,
-        *,
-        timeout: float = 60.0,
-        memory: float = 1.0,
-        seed: int = 0,
-        workers: int = 0,
-        physics: str = "auto",
-    ) -> None:
+    @takes(ProcessSettings)
+    def __init__(self, reward: Any, **settings: Any) -> None:
         if not isinstance(reward, str | Mapping):
             raise InvalidInputError(f"only a reward given by name or as a mapping can be isolated, got {reward!r}")
-        check_limits(timeout, memory)
+        self.settings = ProcessSettings(**settings)
         self.name = self.__name__ = reward_name(reward)
-        self.seed = seed
-        self.timeout, self.memory, self.workers, self.physics = timeout, memory, workers, physics
         self._reward = reward
         self._worker: Process | None = None
         self._lock = threading.Lock()
@@ -93,7 +110,7 @@ class IsolatedReward:
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score in the worker; the batch may be on any device."""
         scenes = batch.tensor.detach().cpu().contiguous().numpy()
-        facts = context.prompts, self.seed if context.seed == 0 else context.seed, current_draw()
+        facts = context.prompts, self.settings.seed if context.seed == 0 else context.seed, current_draw()
         body = self._ask("score", replace(batch.scene_type), scenes, facts)
 
         def tensor(array: Any) -> Any:
@@ -123,22 +140,14 @@ class IsolatedReward:
 
     def _ask(self, *message: Any) -> Any:
         with self._lock:
-            return _answer(self._started(), self.name, message, self.timeout)
+            return _answer(self._started(), self.name, message, self.settings.timeout)
 
     def _started(self) -> Process:
         if self._worker is None or not self._worker.is_alive:
-            self._worker = _start(self.name, self.memory)
+            self._worker = _start(self.name, self.settings.memory)
             try:
-                message = (
-                    "make",
-                    self._reward,
-                    allowed_targets(),
-                    allowed_files(),
-                    self.workers,
-                    self.physics,
-                    self.seed,
-                )
-                vars(self).update(_answer(self._worker, self.name, message, self.timeout))
+                message = ("make", self._reward, allowed_targets(), allowed_files(), self.settings)
+                vars(self).update(_answer(self._worker, self.name, message, self.settings.timeout))
             except BaseException:
                 self.close()
                 raise
@@ -185,7 +194,7 @@ class RewardRunner:
         """Call the method that the message names; raises InvalidInputError, UnknownNameError and RewardError alone."""
         method, *arguments = message
         try:
-            return getattr(self, method)(*arguments)
+            return reward_info(*arguments) if method == "describe" else getattr(self, method)(*arguments)
         except MemoryError:
             raise RewardError("the reward took more memory than reward_limits.memory allows") from None
         except SceneEnvsError as error:
@@ -197,31 +206,24 @@ class RewardRunner:
         except BaseException as error:
             raise RewardError(f"the reward raised {describe_error(error)}") from None
 
-    def make(
-        self, reward: Any, targets: list[str], files: list[Any], workers: int, physics: str, seed: int
-    ) -> dict[str, bool]:
+    def make(self, reward: Any, targets: list[str], files: list[Any], settings: ProcessSettings) -> dict[str, bool]:
         """Make the reward, with generators seeded from the run's; returns its facts."""
         for target in targets:
             allow_reward_targets(target)
         for file in files:
             allow_local_rewards(file)
-        with seeded_generators(seed):
+        with seeded_generators(settings.seed):
             self.reward = resolve_reward(reward)
         for part in learned_parts(self.reward):
             raise InvalidInputError(
                 f"reward {reward_name(part)!r} learns in the process of a run, but {reward_name(self.reward)!r} has "
                 "parts of other packages and runs in a process of its own; combine it with this package's rewards alone"
             )
-        self.pool = make_pool(workers, physics=physics)
+        self.pool = make_pool(settings.workers, physics=settings.physics)
         return facts_of(self.reward)
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
-        """The largest value that the reward declares."""
         return declared_maximum(self.reward, slots, free_slots)
-
-    def describe(self, name: str) -> RewardInfo:
-        """The listing of a reward, whose plug-in is imported."""
-        return reward_info(name)
 
     def score(self, scene_type: Any, scenes: Any, facts: tuple[Any, int, int]) -> dict[str, Any]:
         """Score one batch; returns the output as arrays."""
@@ -250,35 +252,24 @@ class SeededReward:
         with seeded_generators(seed):
             self.reward = resolve_reward(reward)
         self.described_by, self.name, self.seed = self.reward, reward_name(self.reward), seed
+        self.maximum = partial(declared_maximum, self.reward)
         vars(self).update(facts_of(self.reward))
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score with the seed of the run."""
         return evaluate_reward(self.reward, batch, replace(context, seed=self.seed), strict=True)
 
-    def maximum(self, slots: int, free_slots: int) -> float | None:
-        """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
-        return declared_maximum(self.reward, slots, free_slots)
 
-
-def run_reward(
-    reward: Any,
-    *,
-    seed: int = 0,
-    timeout: float = 60.0,
-    memory: float = 1.0,
-    workers: int = 0,
-    physics: str = "auto",
-) -> Any:
+def run_reward(reward: Any, **settings: Any) -> Any:
     """A reward as runs use it: one of this package in this process, any other in a process that can be ended, except
-    functions and objects, which exist in this process alone. Arguments as for :class:`IsolatedReward`.
+    functions and objects, which exist in this process alone. ``settings`` are fields of :class:`ProcessSettings`.
 
     >>> run_reward("object_count")
     ObjectCount()
     """
-    check_limits(timeout, memory)
     if is_foreign(reward):
-        return IsolatedReward(reward, timeout=timeout, memory=memory, seed=seed, workers=workers, physics=physics)
+        return IsolatedReward(reward, **settings)
+    seed = ProcessSettings(**settings).seed
     with seeded_generators(seed):
         resolved = resolve_reward(reward)
     return resolved if isinstance(reward, str) and is_own(resolved) else SeededReward(resolved, seed)
@@ -330,13 +321,6 @@ def is_foreign(reward: Any) -> bool:
     if module is None or module == "__main__" or module.split(".")[0] in ("rewards", "scene_envs", "agents"):
         return False
     return plugin_module(reward) is not None  # if not: registered by a module imported in this process alone
-
-
-def check_limits(timeout: float, memory: float) -> None:
-    """Refuse limits that are not positive numbers."""
-    for name, value in (("timeout", timeout), ("memory", memory)):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < float("inf"):
-            raise InvalidInputError(f"{name}={value!r} must be a positive number")
 
 
 def _parts(reward: Any) -> list[Any]:

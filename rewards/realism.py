@@ -50,7 +50,7 @@ class Realism:
             UnknownNameError: there is no such prior, or none of the scene type's name.
             InvalidInputError: the prior is of another scene type, or has no training loss.
         """
-        prior = _frozen(batch.scene_type.name if self.prior is None else self.prior)
+        prior = _frozen(batch.scene_type.name if self.prior is None else self.prior, str(batch.tensor.device))
         if prior.scene_type.assets != batch.scene_type.assets:
             raise InvalidInputError(
                 f"realism: the prior is of scene type {prior.scene_type.name!r}, the scenes are of "
@@ -77,8 +77,8 @@ class Realism:
 
 
 @lru_cache(maxsize=4)
-def _frozen(prior: Any) -> LikelihoodPriorLike:
-    resolved = resolve_prior(prior)
+def _frozen(prior: Any, device: str) -> LikelihoodPriorLike:
+    resolved = resolve_prior(prior, device)
     if not isinstance(resolved, LikelihoodPriorLike):
         raise InvalidInputError(
             f"realism: {prior!r} has no encode() and pretraining_loss(); give a prior that has them"

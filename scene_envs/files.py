@@ -1,4 +1,4 @@
-"""Files: atomic writes, digests, the claim of a folder by one writer, tensors, pages, and where scenes are in a folder.
+"""Files: atomic writes, digests, the claim of a folder by one writer, tensors, pages, the cache, places of scenes.
 
 The module does not import torch.
 """
@@ -87,20 +87,22 @@ def read_sealed(path: str | os.PathLike[str]) -> str:
     return rest if head.startswith(_SEAL) else text
 
 
-def is_file(path: Path) -> bool:
-    """Whether ``path`` is a file; False also for names that the operating system does not allow."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
+def cache_folder() -> Path:
+    """Folder of what runs share: ``$SCENE_ENVS_CACHE``, else ``scene_envs`` in the user's cache folder."""
+    if chosen := os.environ.get("SCENE_ENVS_CACHE"):
+        return Path(chosen).expanduser()
+    if os.name == "nt" and (local := os.environ.get("LOCALAPPDATA")):
+        return Path(local) / "scene_envs" / "cache"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scene_envs"
 
 
-def exists(path: Path) -> bool:
-    """Whether ``path`` exists; False also for names that the operating system does not allow."""
-    try:
-        return path.exists()
-    except (OSError, ValueError):
-        return False
+def trim_folder(folder: Path, size: int) -> None:
+    """Remove the files of ``folder`` that were used longest ago, until the others hold at most ``size`` bytes."""
+    found = sorted(((path.stat(), path) for path in folder.glob("[!.]*")), key=lambda item: -item[0].st_mtime)
+    for state, path in found:
+        size -= state.st_size
+        if size < 0:
+            path.unlink(missing_ok=True)
 
 
 def storage_error(path: str | os.PathLike[str], error: OSError) -> StorageError:
@@ -237,10 +239,12 @@ def _lock(path: Path, owner: str) -> int:
         except OSError as error:
             writer = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
             os.close(descriptor)
+            elsewhere = writer and f" on {socket.gethostname()}, since" not in writer
+            takeover = f"; if that computer was switched off, remove {str(path)!r}" if elsewhere else ""
             if error.errno in (errno.EAGAIN, errno.EACCES):
                 raise InvalidInputError(
                     f"{str(path.parent)!r} is being written by {writer or 'another process'}; wait until it is done, "
-                    f"or give another output{_takeover(writer, path)}"
+                    f"or give another output{takeover}"
                 ) from None
             raise
         if (foreign := _owner_elsewhere(descriptor)) is not None:
@@ -257,11 +261,6 @@ def _lock(path: Path, owner: str) -> int:
                 os.pwrite(descriptor, text.encode(), 0)
                 return descriptor
         os.close(descriptor)
-
-
-def _takeover(writer: str, path: Path) -> str:
-    elsewhere = writer and f" on {socket.gethostname()}, since" not in writer
-    return f"; if that computer was switched off, remove {str(path)!r}" if elsewhere else ""
 
 
 def _owner_elsewhere(descriptor: int) -> str | None:
@@ -313,7 +312,7 @@ def find_scenes(path: Path) -> Path:
     """The file or folder of scenes that ``scenes=`` names; for a run's folder, the scene file in it. Raises
     InvalidInputError where ``path`` does not exist, or the folder holds a prior and no scenes.
     """
-    if not exists(path):
+    if not os.path.exists(path):  # False also for names that the operating system does not allow
         raise InvalidInputError(
             f"scenes={str(path)[:200]!r}: no scene file, run or dataset is there; sample and generate make them"
         )
@@ -388,8 +387,9 @@ def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[
     except FileNotFoundError:
         raise
     except (SafetensorError, OSError, ValueError, RuntimeError, MemoryError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise CorruptFileError(
-            f"{str(path)!r} is truncated or not a safetensors file ({_short(error)}); copy it again or make it anew"
+            f"{str(path)!r} is truncated or not a safetensors file ({reason}); copy it again or make it anew"
         ) from error
     digest = metadata.pop(DIGEST, None)
     if digest is not None and digest != tensors_digest(tensors, metadata):
@@ -417,7 +417,3 @@ def tensors_digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | 
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
         digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def _short(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]

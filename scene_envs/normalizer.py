@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from scene_envs.arrays import constant_on
 from scene_envs.errors import InvalidInputError
 
 _ZERO_RANGE = 1e-6
@@ -57,7 +59,7 @@ class Normalizer:
         offset = torch.where(constant, torch.zeros_like(span), -1.0 - input_min * (2.0 / safe))
         return cls(scale.float(), offset.float(), input_min.float(), input_max.float())
 
-    @property
+    @cached_property
     def is_constant(self) -> Tensor:
         """(D,) bool: features that never vary."""
         return self.scale == 0
@@ -65,15 +67,19 @@ class Normalizer:
     def normalize(self, raw: Tensor) -> Tensor:
         """Raw (..., D) to normalised (..., D)."""
         self._require_width(raw)
-        return raw * self.scale.to(raw) + self.min.to(raw)
+        return raw * self._on(self.scale, raw) + self._on(self.min, raw)
 
     def unnormalize(self, normalised: Tensor) -> Tensor:
         """Normalised (..., D) to raw (..., D); constant features take their constant."""
         self._require_width(normalised)
-        constant = self.is_constant.to(normalised.device)
-        scale = self.scale.to(normalised)
-        raw = (normalised - self.min.to(normalised)) / torch.where(constant, torch.ones_like(scale), scale)
-        return torch.where(constant, self.input_min.to(normalised), raw)
+        constant = constant_on(self.is_constant, normalised.device)
+        scale = self._on(self.scale, normalised)
+        raw = (normalised - self._on(self.min, normalised)) / torch.where(constant, torch.ones_like(scale), scale)
+        return torch.where(constant, self._on(self.input_min, normalised), raw)
+
+    @staticmethod
+    def _on(constant: Tensor, like: Tensor) -> Tensor:
+        return constant_on(constant, like.device).to(like.dtype)
 
     def _require_width(self, x: Tensor) -> None:
         if x.shape[-1] != self.scale.shape[0]:

@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Collection
 from time import perf_counter
-from types import TracebackType
 from typing import Any
 
 from scene_envs.errors import MissingDependencyError, unknown_name
@@ -64,9 +63,7 @@ class Progress:
         self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self._bar.stop()
 
     @property

@@ -85,7 +85,7 @@ def load_plugin(point: EntryPoint) -> Any:
     except SystemExit as error:
         raise PluginError(f"it calls sys.exit({str(error.code)[:80]}) when it is imported") from None
     except BaseException as error:
-        raise PluginError(f"{type(error).__name__}: {_text(error)}") from error
+        raise PluginError(describe_error(error)) from error
 
 
 class PluginError(SceneEnvsError):
@@ -94,14 +94,27 @@ class PluginError(SceneEnvsError):
 
 _LATE = "the import of a plug-in takes too long"
 _MAX_TEXT = 500
+"""Number of characters of a foreign error that a message repeats."""
 
 
-def _text(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
+    """Type and text of an error of foreign code, of bounded length.
+
+    >>> describe_error(ValueError("no")), len(describe_error(ValueError("x" * 10**6))) < 600
+    ('ValueError: no', True)
+    """
+    text = error_text(error)
+    name = type.__dict__["__name__"].__get__(type(error))  # a metaclass may override ``__name__``
+    return f"{name}: {text}" if text else str(name)
+
+
+def error_text(error: BaseException) -> str:
+    """The text of an error of foreign code, of bounded length."""
     try:
         text = str(error)
-    except Exception:
+    except BaseException:
         return "(its text cannot be read)"
-    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}..."
+    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}... ({len(text)} characters)"
 
 
 def _seconds() -> float:

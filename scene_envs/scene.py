@@ -289,9 +289,9 @@ class SceneBatch:
                     f"slots={slots}: the scenes have an object in slot {needed - 1}; at least {needed} slots hold them"
                 )
             return SceneBatch(self._tensor[:, :slots], self.scene_type)
-        extra = torch.zeros(len(self), slots - self._tensor.shape[1], self.scene_type.features)
+        extra = self._tensor.new_zeros(len(self), slots - self._tensor.shape[1], self.scene_type.features)
         extra[..., -1] = 1.0
-        return SceneBatch(torch.cat([self._tensor, extra.to(self._tensor)], dim=1), self.scene_type)
+        return SceneBatch(torch.cat([self._tensor, extra], dim=1), self.scene_type)
 
     def with_poses(self, translations: Tensor, rotations: Tensor) -> SceneBatch:
         """The same objects at new poses; (B, N, 3) m and (B, N, 3, 3)."""

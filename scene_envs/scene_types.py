@@ -153,12 +153,7 @@ class SceneType:
 
     @property
     def fixed_categories(self) -> tuple[int, ...]:
-        """Categories of the welded assets of fixed objects, ascending.
-
-        >>> from scene_envs import get_scene_type
-        >>> get_scene_type("dimsum_table").fixed_categories
-        (0,)
-        """
+        """Categories of the welded assets of fixed objects, ascending."""
         return tuple(sorted({self.assets.index(f.asset) for f in self.fixed if f.asset in self.welded}))
 
     @property
@@ -167,10 +162,6 @@ class SceneType:
 
         Assets of a scene type made from a dataset's metadata may have no models. Without models there are no
         physics and no pictures, but priors can be sampled.
-
-        >>> from scene_envs import get_scene_type
-        >>> get_scene_type("dimsum_table").has_geometry
-        True
         """
         from scene_envs.assets import list_assets
         from scene_envs.assets.importing.user_library import folder_index

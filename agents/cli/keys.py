@@ -7,10 +7,9 @@ import inspect
 import shutil
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 from docstring_parser import DocstringStyle, parse
 
@@ -24,7 +23,6 @@ from agents.configuration.composition import (
     field_options,
     group_options,
     merged,
-    parts_of,
     plain_tree,
     reason_of,
 )
@@ -59,19 +57,12 @@ _OPENING = "[{('\""
 """First characters of values that are no list without brackets."""
 
 
-@dataclass(frozen=True)
-class KeyHelp:
-    """One key of a command.
+class KeyHelp(NamedTuple):
+    """One key of a command."""
 
-    Attributes:
-        name: the text before ``=``; a key of a group begins with the name of the group and a dot.
-        default: its default, as it would be typed.
-        meaning: one sentence.
-    """
-
-    name: str
-    default: str
-    meaning: str
+    name: str  # the text before ``=``; a key of a group begins with the name of the group and a dot
+    default: str  # as it would be typed
+    meaning: str  # one sentence
 
 
 _ADAPTER = KeyHelp(
@@ -97,12 +88,8 @@ def describe_fields(config: type | Any) -> list[KeyHelp]:
 
 
 def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "") -> str:
-    """All keys with their values and meanings, a paragraph for each part and for each group with its options.
-
-    Args:
-        config: the config that ``words`` make, or its class.
-        words: options of groups among them stand in the headings.
-        config_dir: a folder with further options.
+    """All keys with their values and meanings, a paragraph for each part and for each group with its options; the
+    headings name those that ``words`` choose.
     """
     chosen = dict(word.partition("=")[::2] for word in words)
     sections = _sections(config)
@@ -123,8 +110,11 @@ def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "
 def _sections(config: type | Any) -> list[tuple[type | dataclasses.Field[Any], list[KeyHelp]]]:
     """The keys that are no groups by the class that declares them, then those of each group by its field."""
     made = config() if isinstance(config, type) else config
-    parts = [(part, sorted(_keys(made, own), key=_place)) for part, own in parts_of(type(made)).items()]
-    groups = [(field, getattr(made, field.name)) for field in dataclasses.fields(made)]
+    kinds, fields = type(made).__mro__, dataclasses.fields(made)
+    first = {name: part for part in kinds for name in inspect.get_annotations(part)}  # declares the key first
+    own = [(part, [field for field in fields if first[field.name] is part]) for part in kinds]
+    parts = [(part, sorted(_keys(made, declared), key=_place)) for part, declared in own]
+    groups = [(field, getattr(made, field.name)) for field in fields]
     return [
         *sorted(((part, keys) for part, keys in parts if keys), key=lambda section: _place(section[1][0])),
         *(
@@ -183,12 +173,8 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
     Values are written as in Hydra: numbers, ``true``, ``null``, ``[1, 2]``, ``{name: clip, high: 20}``, ``${seed}``;
     the brackets of a list may be left out. The value of a key that takes one text is that text as it stands.
 
-    Args:
-        command: the command's name, for messages.
-        config: dataclass of its keys.
-        words: what was typed.
-        config_dir: folder with further groups and experiments; empty for none.
-        config_file: ``config.yaml`` whose values take the place of the defaults; empty for none.
+    ``config_dir`` is a folder with further groups and experiments, and the values of ``config_file`` take the place of
+    the defaults; empty for none.
 
     Raises:
         UnknownNameError: no such key or option; the nearest one is offered.
@@ -243,12 +229,7 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
 
 
 def read_config(path: str) -> dict[str, Any]:
-    """The values of a ``config.yaml``.
-
-    Raises:
-        InvalidInputError: there is no such file.
-        CorruptFileError: it holds no mapping.
-    """
+    """The values of a ``config.yaml``; an InvalidInputError without the file, a CorruptFileError without a mapping."""
     import yaml
 
     try:

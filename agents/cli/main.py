@@ -6,6 +6,7 @@ traceback only under ``--traceback`` or ``SCENE_ENVS_TRACEBACK=1``.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import dataclasses
 import errno
@@ -36,6 +37,7 @@ from agents.configuration.composition import (
 from agents.configuration.prior_names import find_prior, split_name
 from agents.utils.interrupts import Terminated, terminable
 from scene_envs import __version__
+from scene_envs.arrays import resolve_device
 from scene_envs.errors import (
     CorruptFileError,
     InvalidInputError,
@@ -45,7 +47,7 @@ from scene_envs.errors import (
     UnknownNameError,
     unknown_name,
 )
-from scene_envs.files import exists, find_scenes
+from scene_envs.files import find_scenes
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -64,6 +66,11 @@ scene-envs COMMAND --help lists the keys of a command; --traceback shows where a
 --allow-local allows reward=./my_rewards.py:clutter to run that file without a question.
 A command writes into output=FOLDER, by default runs/COMMAND-TIME.
 """
+_FLAGS = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+for _names in (["--config-dir"], ["--config"], ["--cfg", "-c"]):
+    _FLAGS.add_argument(*_names, default="")
+for _names in (["--allow-local"], ["--multirun", "-m"], ["--help", "-h"]):
+    _FLAGS.add_argument(*_names, action="store_true")
 _MINIMA = {
     "count": 1,
     "num_steps": 1,
@@ -78,39 +85,31 @@ _MINIMA = {
 }
 """The least that a number may be, where a config's ``LEAST`` does not say otherwise."""
 _DEVICE = (
-    r"(cpu|cuda|mps|xpu|hpu|mtia|xla|ipu|hip|ve|vulkan|maia|lazy|meta|privateuseone|npu|mlu|musa|mkldnn|opengl|opencl|"
+    r"(auto|cpu|cuda|mps|xpu|hpu|mtia|xla|ipu|hip|ve|vulkan|maia|lazy|meta|privateuseone|npu|mlu|musa|mkldnn|opengl|opencl|"
     r"ideep|fpga)(:\d{1,4})?"
 )
-"""Devices that torch knows."""
+"""Devices that torch knows, and their automatic choice."""
 _DATASETS = ("data", "heldout", "regularisation.scenes")
 _GRAMMAR = "grammar"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status.
-
-    Args:
-        argv: the words after ``scene-envs``; those of the process by default.
-    """
-    return _guarded(list(sys.argv[1:] if argv is None else argv), _dispatch)
+    """Run one command and return its exit status; ``argv`` replaces the words of the process after ``scene-envs``."""
+    return _guarded(argv, _dispatch)
 
 
 def main_of(command: str, meaning: str, module: ModuleType, argv: Sequence[str] | None = None) -> int:
     """Run a program that consists of one command, and return its exit status.
 
-    Args:
-        command: its name in messages and in the name of its folder.
-        meaning: what it does, in one phrase.
-        module: has ``run(settings, run)``, as a module of :mod:`agents.cli.commands`.
-        argv: the words after the program; those of the process by default.
+    ``command`` is its name in messages and in the name of its folder, ``meaning`` what it does, in one phrase, and
+    ``module`` has ``run(settings, run)``, as those of :mod:`agents.cli.commands`.
     """
-    return _guarded(
-        list(sys.argv[1:] if argv is None else argv), lambda words: _run_or_help(command, meaning, module, words)
-    )
+    return _guarded(argv, lambda words: _run_or_help(command, meaning, module, words))
 
 
-def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
+def _guarded(argv: Sequence[str] | None, work: Callable[[list[str]], int]) -> int:
     """The exit status of ``work``, whose errors become one paragraph on stderr."""
+    words = list(sys.argv[1:] if argv is None else argv)
     show_traceback = os.environ.get("SCENE_ENVS_TRACEBACK", "") not in ("", "0")
     if "--traceback" in words:
         show_traceback = True
@@ -127,10 +126,6 @@ def _guarded(words: list[str], work: Callable[[list[str]], int]) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as in `scene-envs rewards | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
-    except RecursionError as error:
-        if show_traceback:
-            traceback.print_exc()
-        return _complain(f"a value or a file is nested too deeply ({_cut(error)}); write it flatter", WRONG_INPUT)
     except Exception as error:
         if show_traceback:
             traceback.print_exc()
@@ -153,10 +148,8 @@ def _ended(status: int) -> int:
 
 
 def entry_point() -> None:
-    """Run as a program, in which idle threads of OpenMP sleep after a short wait unless the environment says otherwise.
-
-    By default idle threads wait busily. Where other work shares the cores, they take processor time away from the
-    threads for which they wait.
+    """Run as a program, in which idle threads of OpenMP sleep after a short wait unless the environment says otherwise:
+    threads that wait busily take processor time from those for which they wait, where other work shares the cores.
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)  # read when torch loads OpenMP
@@ -177,16 +170,19 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str]) -> int:
-    words = list(words)
-    config_dir, file = _option(words, "--config-dir"), _option(words, "--config")
-    allow_local = _flag(words, "--allow-local")
-    shown, sweep, asked = _option(words, "--cfg", "-c"), _flag(words, "--multirun", "-m"), _flag(words, "-h", "--help")
+    try:
+        flags, words = _FLAGS.parse_known_args(words)
+    except argparse.ArgumentError as error:
+        name = str(error.argument_name).partition("/")[0]
+        wrong = "takes no value" if "explicit" in error.message else f"needs a value behind it, as in {name} VALUE"
+        raise InvalidInputError(f"{name} {wrong}") from None
+    config_dir, file, shown, sweep = flags.config_dir, flags.config, flags.cfg, flags.multirun
     if shown not in ("", "job"):
         raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
     command = program.removeprefix("scene-envs ")
     named = _named(words, getattr(module, "POSITIONAL", ()))
     keys = keys_of(module)
-    if asked:
+    if flags.help:
         config = keys if sweep or not named else compose(command, keys, named, config_dir, file)
         print(f"{program}: {meaning}.\n\n{help_text(config, named, config_dir)}")
         return DONE
@@ -195,7 +191,7 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
     variants = expand_sweeps(named) if sweep else [(named, "")]
     runs = [(compose(command, keys, variant, config_dir, file), label) for variant, label in variants]
     for settings, _ in runs if not shown else ():
-        _check(settings, module, allow_local)
+        _check(settings, module, flags.allow_local)
     folder = ""
     for settings, label in runs:
         if sweep:  # each run has a folder of its own below ``output``
@@ -232,29 +228,6 @@ def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> No
             module.run(settings, run)
 
 
-def _option(words: list[str], *names: str) -> str:
-    """The value of ``--name VALUE`` or ``--name=VALUE``, taken out of the words; empty where it is not given."""
-    for position, word in enumerate(words):
-        name, equals, value = word.partition("=")
-        if name not in names:
-            continue
-        del words[position]
-        if not equals:
-            if position == len(words):
-                raise InvalidInputError(f"{name} needs a value behind it, as in {name} VALUE")
-            value = words.pop(position)
-        return value
-    return ""
-
-
-def _flag(words: list[str], *names: str) -> bool:
-    """Whether a flag is among the words; takes it out."""
-    found = [word for word in words if word in names]
-    for word in found:
-        words.remove(word)
-    return bool(found)
-
-
 def _named(words: Sequence[str], keys: Sequence[str]) -> list[str]:
     """The words; each one without ``=`` gets the next of ``keys`` in front, and stays as it is when none is left."""
     left = iter(keys)
@@ -265,6 +238,8 @@ def _verdict(error: Exception) -> tuple[str, int]:
     """The message for the user, and the exit status."""
     if isinstance(error, InvalidInputError | UnknownNameError | CorruptFileError):
         return str(error), WRONG_INPUT
+    if isinstance(error, RecursionError):
+        return f"a value or a file is nested too deeply ({_cut(error)}); write it flatter", WRONG_INPUT
     if isinstance(error, SceneEnvsError):
         return str(error), FAILED
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -339,7 +314,7 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     if (prior := getattr(settings, "prior", None)) and isinstance(prior, str):
         own_name, adapters = split_name(prior)
         find_prior(own_name)
-        for part in adapters.split("+") if adapters and not exists(Path(adapters)) else ():
+        for part in adapters.split("+") if adapters and not os.path.exists(adapters) else ():
             find_prior(part.rpartition("*")[2].strip())
     for key in ("reward", "objective"):
         _check_name("reward", getattr(settings, key, None), known_rewards)
@@ -349,14 +324,14 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
         _check_name("scene type", scene, known_scenes)
     for mask in [getattr(settings, "mask", None), *(getattr(settings, "masks", None) or [])]:
         _check_name("mask", mask, known_masks)
-    device = getattr(settings, "device", "cpu")
+    device = getattr(settings, "device", "auto")
     if not re.fullmatch(_DEVICE, device):
-        raise InvalidInputError(f"device={device[:60]!r} is no torch device; give cpu, cuda or cuda:1")
+        raise InvalidInputError(f"device={device[:60]!r} is no torch device; give auto, cpu, cuda or cuda:1")
     if hasattr(settings, "progress"):
         require_one_of(settings, "progress", PROGRESS_STYLES)
     if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
         find_scenes(Path(scenes))
-    resumed = exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
+    resumed = os.path.exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
     kept = {"regularisation.scenes"} if resumed else set()  # a resumed run has them in its folder
     for key in set(_DATASETS) - kept - set(getattr(settings, "NO_PATHS", ())):
         _check_dataset(key, functools.reduce(lambda value, part: getattr(value, part, None), key.split("."), settings))
@@ -368,8 +343,8 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     for key in ("reward", "objective"):
         if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
             _ask_for_files(key, getattr(settings, key), allow_local)
-    if device != "cpu":
-        check_device(device)
+    if device not in ("auto", "cpu"):  # neither needs torch to be checked
+        resolve_device(device)
 
 
 def _check_numbers(settings: Any) -> None:
@@ -400,7 +375,7 @@ def _check_dataset(key: str, value: Any) -> None:
     if value and not any(parts):
         raise InvalidInputError(f"{key}={value[:200]!r} names no dataset; scene-envs generate makes one")
     for part in filter(None, parts):
-        if part != _GRAMMAR and not exists(Path(part)):
+        if part != _GRAMMAR and not os.path.exists(part):
             raise InvalidInputError(
                 f"{key}={value[:200]!r}: nothing is at {part[:200]!r}; name a dataset, as scene-envs generate makes one"
             )
@@ -417,25 +392,3 @@ def _check_guidance(settings: Any) -> None:
         check_claim_guidance(prompt, strength)
     if strength := getattr(settings, "physics_guidance", 0.0):
         check_physics_guidance(strength)
-
-
-def check_device(name: str) -> None:
-    """Raise unless torch knows the device and this machine has it.
-
-    Raises:
-        InvalidInputError: the device cannot be used; the message says which would work.
-
-    >>> check_device("cpu")
-    """
-    import torch
-
-    try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
-    except Exception:  # each backend has errors of its own
-        here = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
-        raise InvalidInputError(
-            f"device={str(name)[:60]!r} is not a torch device of this machine; use one of {', '.join(here)}"
-        ) from None
-    if device.type == "meta":
-        raise InvalidInputError("device='meta' stores no data; give cpu or cuda")

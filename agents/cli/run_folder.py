@@ -90,7 +90,7 @@ class Run:
 
     def __enter__(self) -> Run:
         if not self._is_first:
-            self._make_folder()
+            self.directory.mkdir(parents=True, exist_ok=True)
             return self
         self._claim.enter_context(claimed(self.directory, f"scene-envs {self.command}"))
         try:
@@ -105,12 +105,6 @@ class Run:
                 raise storage_error(self.directory, error) from error
             raise
         return self
-
-    def _make_folder(self) -> None:
-        try:
-            self.directory.mkdir(parents=True, exist_ok=True)
-        except (FileExistsError, NotADirectoryError):
-            raise InvalidInputError(f"output={str(self.directory)!r} is a file, not a folder; give another") from None
 
     def _holds_results(self) -> bool:
         """Whether the folder holds results of this command; refuses those of another, or of other keys."""

@@ -26,7 +26,13 @@ from scene_envs.registry import load_plugins, plugin_entry_points
 Config = TypeVar("Config")
 Kind = TypeVar("Kind", bound=type)
 
-_WANTED: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
+_WANTED: dict[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "a text",
+    NoneType: "null",
+}
 PROGRESS_STYLES = ("bar", "lines", "none")
 """How progress is shown, as in :data:`scene_envs.progress.STYLES`."""
 
@@ -71,46 +77,35 @@ def require_one_of(settings: Any, name: str, known: Sequence[str], what: str = "
 def check_types(kind: type, values: Mapping[str, Any]) -> None:
     """Refuse values of the wrong type for the fields of a dataclass that are numbers, texts or booleans.
 
-    Raises:
-        InvalidInputError: a value of another type; names the field.
-
     >>> from dataclasses import make_dataclass
     >>> check_types(make_dataclass("Size", [("depth", int)]), {"depth": "deep"})
     Traceback (most recent call last):
-    scene_envs.errors.InvalidInputError: depth='deep' must be of type int
+    scene_envs.errors.InvalidInputError: depth=deep is not a whole number
     """
     for name, wanted in get_type_hints(kind).items():
         plain = set(get_args(wanted) if get_origin(wanted) in (Union, types.UnionType) else (wanted,))
         if name not in values or not plain <= {int, float, str, bool, NoneType}:
             continue
         value = values[name]
-        fits = any(type(value) is one or (one is float and type(value) is int) for one in plain)
+        fits = type(value) in plain or (float in plain and type(value) is int)
         if not fits or (isinstance(value, float) and not math.isfinite(value)):
-            expected = " or ".join(sorted("null" if one is NoneType else one.__name__ for one in plain))
-            raise InvalidInputError(f"{name}={str(value)[:100]!r} must be of type {expected}")
+            _refuse(wanted, value, name)
 
 
 # Dataclasses from nested mappings and back
 
 
 def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: str = "") -> Config:
-    """An instance of the dataclass ``kind`` from a nested mapping; missing keys keep their defaults.
-
-    Args:
-        kind: a dataclass, whose groups are dataclasses as well.
-        tree: values by field name.
-        path: place of ``tree`` in messages, such as ``"optimizer."``.
-        command: name of the command in messages.
+    """An instance of the dataclass ``kind`` from a nested mapping; missing keys keep their defaults. ``path`` is the
+    place of ``tree`` in messages, such as ``"optimizer."``.
 
     Raises:
         UnknownNameError: a key that ``kind`` does not have; the nearest one is offered.
         InvalidInputError: a value is not of the type of its key.
     """
-    values = field_values(kind, tree, path, command)
-    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
-        if field.init and field.name not in values:
-            values[field.name] = default_of(field)
-    return kind(**values)
+    made, init = object.__new__(kind), kind.__init__  # type: ignore[misc]
+    getattr(init, "__wrapped__", init)(made, **field_values(kind, tree, path, command))  # composed() composes again
+    return made
 
 
 def field_values(kind: type, tree: Mapping[str, Any], path: str = "", command: str = "") -> dict[str, Any]:
@@ -134,7 +129,7 @@ def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, com
                 f"{path}={as_command_line_text(value)[:60]} is neither a name nor a mapping with a name"
             )
         alone = isinstance(value, Mapping) and set(value) == {"name"}
-        return value["name"] if alone else _plain(value)
+        return value["name"] if alone else plain_tree(value)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             return value
@@ -144,63 +139,31 @@ def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, com
                 f"{path}={as_command_line_text(value)}: {path} is a group of keys; give one of {keys}"
             )
         if find := field.metadata.get("kinds"):  # the name of a component decides which settings it has
-            hint = find(value["name"] if "name" in value else default_of(field).name)
+            hint = find(value.get("name", getattr(field.default_factory, "name", "")))
         return build(hint, value, f"{path}.", command)
     return _scalar(hint, value, path)
-
-
-def default_of(field: dataclasses.Field[Any]) -> Any:
-    """The default of a field, a new one where there is a factory."""
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return None if field.default is dataclasses.MISSING else field.default
-
-
-def parts_of(kind: type) -> dict[type, list[dataclasses.Field[Any]]]:
-    """Fields of a dataclass by the class that declares them first, its own before those of the classes it extends.
-
-    >>> @dataclasses.dataclass
-    ... class Seeded:
-    ...     seed: int = 0
-    >>> @dataclasses.dataclass
-    ... class Draw(Seeded):
-    ...     count: int = 1
-    >>> {part.__name__: [field.name for field in fields] for part, fields in parts_of(Draw).items()}
-    {'Draw': ['count'], 'Seeded': ['seed']}
-    """
-    first = {name: part for part in kind.__mro__ for name in inspect.get_annotations(part)}
-    parts: dict[type, list[dataclasses.Field[Any]]] = {part: [] for part in kind.__mro__}
-    for field in dataclasses.fields(kind):
-        parts[first[field.name]].append(field)
-    return {part: fields for part, fields in parts.items() if fields}
 
 
 def changed(config: Config, changes: Mapping[str, Any]) -> Config:
     """A copy of a config with some values changed, by dotted key.
 
-    >>> from dataclasses import dataclass, field
-    >>> @dataclass
-    ... class Inner:
-    ...     size: int = 1
-    >>> @dataclass
-    ... class Outer:
-    ...     inner: Inner = field(default_factory=Inner)
-    >>> changed(Outer(), {"inner.size": 3})
-    Outer(inner=Inner(size=3))
+    >>> changed(RewardLimitKeys(), {"reward_limits.timeout": 3})
+    RewardLimitKeys(reward_limits=RewardLimits(timeout=3.0, memory=1.0))
     """
-    groups: dict[str, dict[str, Any]] = {}
-    values: dict[str, Any] = {}
-    known = {field.name for field in dataclasses.fields(config)}  # type: ignore[arg-type]
+    whole: dict[str, Any] = {}
+    parts: dict[str, Any] = {}
     for key, value in changes.items():
-        head, dot, rest = key.partition(".")
-        if head not in known:
+        head, *inner = key.split(".")
+        if not hasattr(config, head):
             raise unknown_name("key", key, dotted_values(config))
-        if dot:
-            groups.setdefault(head, {})[rest] = value
-        else:
-            values[head] = value
-    nested = {name: changed(values.get(name, getattr(config, name)), inner) for name, inner in groups.items()}
-    return dataclasses.replace(config, **{**values, **nested})  # type: ignore[type-var]
+        if not inner:
+            whole[head] = value
+            continue
+        for part in reversed(inner):
+            value = {part: value}
+        before = plain_tree(parts.get(head, whole.get(head, getattr(config, head))))
+        parts[head] = merged(before, value) if isinstance(before, Mapping) else value
+    return dataclasses.replace(config, **{**whole, **field_values(type(config), parts)})  # type: ignore[type-var]
 
 
 def dotted_values(config: Any) -> dict[str, Any]:
@@ -225,48 +188,43 @@ def dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def plain_tree(config: Any) -> dict[str, Any]:
-    """A config as nested mappings of numbers, strings and lists, its keys in the order of :func:`parts_of`."""
-    tree = _plain(config)
-    return {field.name: tree[field.name] for part in parts_of(type(config)).values() for field in part}
+def plain_tree(value: Any) -> Any:
+    """A config as nested mappings, lists, numbers and strings; other values stay as they are."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain_tree(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {key: plain_tree(item) for key, item in value.items()}
+    return [plain_tree(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def config_text(values: Any) -> str:
-    """All keys as the ``config.yaml`` that ``--config`` reads; of a config, or of a nested mapping."""
+    """All keys as the ``config.yaml`` that ``--config`` reads, of a config or a nested mapping; a class's own keys come
+    before those of the classes that it extends.
+    """
     import yaml
 
-    return yaml.safe_dump(plain_tree(values) if dataclasses.is_dataclass(values) else _plain(values), sort_keys=False)
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+    tree = plain_tree(values)
+    own_first = [name for part in type(values).__mro__ for name in inspect.get_annotations(part) if name in tree]
+    return yaml.safe_dump({key: tree[key] for key in [*own_first, *tree]}, sort_keys=False)
 
 
 def _scalar(hint: Any, value: Any, path: str) -> Any:
     origin, arguments = get_origin(hint), get_args(hint)
     if hint is Any:
-        return _plain(value)
+        return plain_tree(value)
     if origin in (Union, types.UnionType):
-        if value is None and type(None) in arguments:
+        if value is None and NoneType in arguments:
             return None
-        options = [option for option in arguments if option is not type(None)]
-        for option in sorted(options, key=lambda option: option is str):  # a list of texts before a text
+        for option in sorted(arguments, key=lambda option: option is str):  # a list of texts before a text
             with contextlib.suppress(InvalidInputError):
                 return _scalar(option, value, path)
-        wanted = " or ".join(map(_wanted, options))
-        raise InvalidInputError(
-            f"{path}={as_command_line_text(value)} is not {wanted}{' or null' * (type(None) in arguments)}"
-        )
+        return _refuse(hint, value, path)
     if origin in (list, tuple):
         if not isinstance(value, list | tuple):
             _refuse(hint, value, path)
         return origin(_scalar(arguments[0], item, path) for item in value) if arguments else origin(value)
     if origin is dict:
-        return _plain(value) if isinstance(value, Mapping) else _refuse(hint, value, path)
+        return plain_tree(value) if isinstance(value, Mapping) else _refuse(hint, value, path)
     if hint is float and isinstance(value, int | float | str) and not isinstance(value, bool):
         try:
             return float(value)  # YAML reads 1e-4 as a text
@@ -285,6 +243,8 @@ def _refuse(hint: Any, value: Any, path: str) -> Any:
 
 
 def _wanted(hint: Any) -> str:
+    if get_origin(hint) in (Union, types.UnionType):
+        return " or ".join(map(_wanted, get_args(hint)))
     if get_origin(hint) in (list, tuple):
         inner = {int: "whole numbers", float: "numbers", str: "texts"}.get((*get_args(hint), Any)[0], "values")
         return f"a list of {inner}"
@@ -308,7 +268,7 @@ def as_command_line_text(value: Any) -> str:
 
 
 def nested(
-    make: Callable[[], Any],
+    make: type,
     *,
     folder: str = "",
     option: str = "",
@@ -319,7 +279,7 @@ def nested(
     """A field that is a group of keys, a dataclass.
 
     Args:
-        make: function that makes the default.
+        make: dataclass of the group.
         folder: name of the group of options in Hydra; empty where there is nothing to choose.
         option: option that is the default.
         kinds: function from the name of a component to the dataclass of its settings; None where all have the same.
@@ -331,11 +291,8 @@ def nested(
 
 
 def named(default: Any, folder: str) -> Any:
-    """A field that names a component, or is a mapping with its ``name`` and settings.
-
-    Args:
-        default: name of the default component, or None.
-        folder: name of the group of options in Hydra: ``reward``, ``mask`` or ``scene``.
+    """A field that names a component, or is a mapping with its ``name`` and settings. ``folder`` is the group of
+    options in Hydra: ``reward``, ``mask`` or ``scene``.
     """
     return dataclasses.field(
         default=default, metadata={"folder": folder, "named": True, "registered": _REGISTERED[folder]}
@@ -390,11 +347,7 @@ def field_options(field: dataclasses.Field[Any], config_dir: str = "") -> list[s
 
 
 def check_option(folder: str, option: str, known: Sequence[str]) -> None:
-    """Refuse an option that a group does not have.
-
-    Raises:
-        UnknownNameError: names the nearest one.
-    """
+    """Refuse an option that a group does not have."""
     if option not in known:
         raise unknown_name(folder, option, known)
 
@@ -438,35 +391,20 @@ def _complete(kind: type, given: Mapping[str, Any], fields: Mapping[str, datacla
     tree = by_hydra(kind.__name__, kind, choices)
     values = field_values(kind, {name: value for name, value in tree.items() if name not in given})
     for name, value in given.items():
-        values[name] = _group(fields[name], name, {} if name in options else value, tree.get(name, {}))
+        values[name] = value
+        if dataclasses.is_dataclass(group := fields[name].default_factory) and isinstance(group, type):
+            base = tree.get(name, {})
+            whole = base if name in options else merged(base, value) if isinstance(value, Mapping) else value
+            values[name] = convert(fields[name], group, whole, name)
     return values
-
-
-def _group(field: dataclasses.Field[Any], name: str, value: Any, base: Mapping[str, Any]) -> Any:
-    """A group given as a mapping becomes its dataclass; other values stay as they are."""
-    if field.default_factory is dataclasses.MISSING or not dataclasses.is_dataclass(default := field.default_factory()):
-        return value
-    tree = value
-    if isinstance(value, Mapping):
-        same = value.get("name", base.get("name")) in (None, getattr(default, "name", None))
-        tree = merged(merged(plain_tree(default) if same and not field.metadata.get("kinds") else {}, base), value)
-    return convert(field, type(default), tree, name)
 
 
 # Composition: Hydra composes the options chosen, its parser reads single values, OmegaConf resolves interpolations
 
 
 def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: str = "") -> dict[str, Any]:
-    """Values of the options chosen, as Hydra composes them; interpolations are not resolved.
-
-    Args:
-        command: name of the command in messages.
-        kind: config dataclass, whose fields say which groups there are.
-        choices: options by field, besides ``recipe`` and ``+experiment``.
-        config_dir: folder with further groups and experiments.
-
-    Raises:
-        InvalidInputError: Hydra cannot read a file.
+    """Values of the options chosen, as Hydra composes them; interpolations are not resolved. ``choices`` are options by
+    field, ``recipe`` and ``+experiment``. An InvalidInputError if Hydra cannot read a file.
     """
     if not choices:
         return {}
@@ -576,10 +514,22 @@ class DeviceKeys:
     """Device of the networks.
 
     Attributes:
-        device: torch device, such as cpu, cuda or cuda:1.
+        device: torch device, such as cpu, cuda or cuda:1; auto is the GPU where torch finds one, else the CPU.
     """
 
-    device: str = "cpu"
+    device: str = "auto"
+
+
+@dataclass
+class PrecisionKeys:
+    """Precision of the chains of a prior.
+
+    Attributes:
+        precision: number format of the products in the blocks of the network: float32, tf32 or bfloat16. Positions,
+            contacts and the last steps are always in float32.
+    """
+
+    precision: str = "float32"
 
 
 @dataclass
@@ -625,7 +575,7 @@ class SamplingKeys(PromptKeys):
 
 
 @dataclass
-class DrawKeys(DeviceKeys):
+class DrawKeys(PrecisionKeys, DeviceKeys):
     """Samples of a prior.
 
     Attributes:
@@ -702,5 +652,5 @@ class TrainingKeys(DeviceKeys):
     output: str = ""
 
 
-MEASURE_NAMES = ("layout", "physics", "ready", "stability", "fsd", "novelty", "prompts", "classifier", "renders", "fid")
+MEASURE_NAMES = ("layout", "physics", "ready", "stability", "fsd", "novelty", "prompts", "classifier", "renders")
 """Groups of measures, in the order in which they are computed: cheap ones first."""

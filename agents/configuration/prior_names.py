@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.files import exists, is_file
 
 SHIPPED = Path(__file__).parents[1] / "priors" / "shipped"
 """Folder of the priors that ship with the package."""
@@ -72,8 +71,8 @@ def find_prior(name: str | os.PathLike[str]) -> Path:
             f"prior={str(name)[:60] + '...'!r} is neither a name nor a path ({len(str(name))} characters)"
         )
     for candidate in (SHIPPED / str(name), path, path / "prior"):
-        if is_file(candidate / CONFIG_NAME):
+        if os.path.isfile(candidate / CONFIG_NAME):
             return candidate
-    if exists(path) or os.sep in str(name):
+    if os.path.exists(path) or os.sep in str(name):
         raise InvalidInputError(f"{str(name)!r} holds no prior: neither it nor its prior/ folder has a {CONFIG_NAME}")
     raise unknown_name("prior", str(name), list_priors())

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from scene_envs.arrays import constant_on
 from scene_envs.errors import InvalidInputError, unknown_name
 
 UNMASKINGS = ("systematic", "even", "independent")
@@ -124,9 +125,11 @@ class CategoricalProcess:
         """Whether a category is either unchanged or masked, so that a visible category is the clean one."""
         return not bool(_replaced(self.schedule.keep, self.schedule.mask).any())
 
-    def rates(self, start: Tensor | int, end: Tensor | int) -> tuple[Tensor, Tensor]:
+    def rates(
+        self, start: Tensor | int, end: Tensor | int, device: torch.device | None = None
+    ) -> tuple[Tensor, Tensor]:
         """keep and mask probability of the stride ``start`` -> ``end`` (start < end), float64."""
-        keep, mask = self.schedule.keep, self.schedule.mask
+        keep, mask = (constant_on(rate, device or rate.device) for rate in (self.schedule.keep, self.schedule.mask))
         kept = keep[end] / keep[start].clamp(min=_TINY)
         masked = 1.0 - (1.0 - mask[end]) / (1.0 - mask[start]).clamp(min=_TINY)
         masked = masked.clamp(0.0, 1.0)
@@ -174,27 +177,23 @@ class CategoricalProcess:
         Returns:
             (B, ..., K + 1) probabilities, rows sum to one; differentiable in ``x0_probs``.
         """
-        t, previous = torch.as_tensor(t), torch.as_tensor(previous)
         keep_s, mask_s = self._rates_at(previous, x_t)
         keep_t, mask_t = self._rates_at(t, x_t)
-        keep_ts, mask_ts = (
-            fitted(rate.to(x_t.device), x_t).unsqueeze(-1) for rate in self.rates(previous.cpu(), t.cpu())
-        )
+        keep_ts, mask_ts = (_broadcast(rate, x_t) for rate in self.rates(previous, t, x_t.device))
         k, masked = self.categories, (x_t == self.categories).unsqueeze(-1)
-        here = F.one_hot(x_t.clamp(max=k - 1), k).double()
+        here = one_hot(x_t, k, torch.float64)
         likelihood = torch.where(masked, mask_t, keep_t * here + _replaced(keep_t, mask_t) / k)  # q(x_t | x_0)
         weight = torch.where(likelihood > _TINY, x0_probs.double() / likelihood.clamp(min=_TINY), 0.0)
         weight = weight / weight.sum(dim=-1, keepdim=True).clamp(min=_TINY)
         back = torch.where(masked, mask_ts, keep_ts * here + _replaced(keep_ts, mask_ts) / k)  # q(x_t | x_s)
         states = back * (keep_s * weight + _replaced(keep_s, mask_s) / k)
-        mask = torch.where(masked, mask_s, torch.zeros_like(mask_s))
-        joint = torch.cat([states, mask.expand(*states.shape[:-1], 1)], dim=-1)
+        joint = torch.cat([states, masked * mask_s], dim=-1)
         return (joint / joint.sum(dim=-1, keepdim=True).clamp(min=_TINY)).to(x0_probs.dtype)
 
-    def _rates_at(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Cumulative keep and mask at ``t``, shaped (B, ..., 1) for states ``like`` (B, ...)."""
-        keep, mask = (rate[t.cpu()].to(like.device) for rate in (self.schedule.keep, self.schedule.mask))
-        return fitted(keep, like).unsqueeze(-1), fitted(mask, like).unsqueeze(-1)
+    def _rates_at(self, t: Tensor | int, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Cumulative keep and mask at ``t``, shaped (B, ..., 1) for states ``like`` (B, ...); () for an int."""
+        keep, mask = (constant_on(rate, like.device)[t] for rate in (self.schedule.keep, self.schedule.mask))
+        return _broadcast(keep, like), _broadcast(mask, like)
 
     def log_prob(self, x_s: Tensor, probs: Tensor) -> Tensor:
         """(...) log-probability of the states ``x_s`` under ``probs`` (..., K + 1)."""
@@ -235,6 +234,16 @@ def _replaced(keep: Tensor, mask: Tensor) -> Tensor:
     """Probability of a uniformly drawn category; exactly 0 where only a rounding error is left."""
     rest = 1.0 - keep - mask
     return torch.where(rest > 1e-12, rest, torch.zeros_like(rest))
+
+
+def _broadcast(rate: Tensor, like: Tensor) -> Tensor:
+    """``rate`` (B,) as (B, ..., 1) beside ``like`` (B, ...); a single number () as it is."""
+    return fitted(rate, like).unsqueeze(-1) if rate.ndim else rate
+
+
+def one_hot(states: Tensor, count: int, dtype: torch.dtype) -> Tensor:
+    """(..., ``count``) rows of states (...); a state beyond the last, such as the mask token, has zeros."""
+    return (states.unsqueeze(-1) == torch.arange(count, device=states.device)).to(dtype)
 
 
 def fitted(rate: Tensor, like: Tensor) -> Tensor:

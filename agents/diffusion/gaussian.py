@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from agents.diffusion.categorical import CategoricalProcess, fitted
+from scene_envs.arrays import constant_on
 from scene_envs.errors import InvalidInputError, unknown_name
 
 PREDICTIONS = ("edm", "epsilon", "x0", "v")
@@ -239,7 +240,8 @@ class GaussianProcess:
         prediction: parameterisation of the network's output (one of :data:`PREDICTIONS`).
         preconditioning: data moments, used by ``"edm"``.
 
-    All timesteps ``t`` are int64 tensors of shape (B,) or (); chains run in float32.
+    Timesteps ``t`` are int64 tensors of shape (B,) or (), or one int for all scenes, for which the numbers of the
+    timestep are computed once per device. Chains run in float32.
     """
 
     def __init__(self, schedule: NoiseSchedule, prediction: str, preconditioning: Preconditioning) -> None:
@@ -249,10 +251,25 @@ class GaussianProcess:
         self.preconditioning = preconditioning
         self.alpha = schedule.alpha_bar.sqrt().float()  # (T + 1,)
         self.sigma = (1.0 - schedule.alpha_bar).sqrt().float()  # (T + 1,)
+        self._kept: dict[Any, tuple[Tensor, ...]] = {}
 
-    def rates(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+    def once(self, t: Tensor | int, like: Tensor, name: str, compute: Callable[[], tuple[Tensor, ...]]) -> Any:
+        """What ``compute`` gives; for an int ``t`` it is kept under ``name`` for the device and type of ``like``."""
+        if isinstance(t, Tensor):
+            return compute()
+        key = name, t, like.device, like.dtype
+        if key not in self._kept:
+            with torch.no_grad():
+                self._kept[key] = compute()
+        return self._kept[key]
+
+    def rates(self, t: Tensor | int, like: Tensor) -> tuple[Tensor, Tensor]:
         """alpha_t and sigma_t, shaped to broadcast against ``like`` (B, N, D)."""
-        alpha, sigma = self.alpha.to(like.device)[t], self.sigma.to(like.device)[t]
+        if isinstance(t, int):
+            alpha, sigma = (constant_on(rate, like.device) for rate in (self.alpha, self.sigma))
+            kept: tuple[Tensor, Tensor] = self.once(t, like, "rates", lambda: (alpha[t], sigma[t]))
+            return kept
+        alpha, sigma = constant_on(self.alpha, like.device)[t], constant_on(self.sigma, like.device)[t]
         return fitted(alpha, like), fitted(sigma, like)
 
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
@@ -265,15 +282,30 @@ class GaussianProcess:
         ratio = self.schedule.alpha_bar[t] / self.schedule.alpha_bar[s]
         return float(ratio.sqrt()) * x_s + float((1.0 - ratio).sqrt()) * noise
 
-    def network_input(self, x_t: Tensor, t: Tensor) -> Tensor:
+    def network_input(self, x_t: Tensor, t: Tensor | int) -> Tensor:
         """x_t scaled to unit variance per feature for ``edm`` (Karras et al. 2022, c_in); x_t itself otherwise."""
         if self.prediction != "edm":
             return x_t
-        alpha, sigma = self.rates(t, x_t)
-        mean, std = self._moments(x_t, None)
-        return (x_t - alpha * mean) / (alpha**2 * std**2 + sigma**2).sqrt()
 
-    def x0_from_output(self, x_t: Tensor, t: Tensor, output: Tensor, moments: Moments | None = None) -> Tensor:
+        def scaling() -> tuple[Tensor, Tensor]:
+            alpha, sigma = self.rates(t, x_t)
+            mean, std = self._moments(x_t, None)
+            return alpha * mean, (alpha**2 * std**2 + sigma**2).sqrt()
+
+        middle, width = self.once(t, x_t, "input", scaling)
+        return (x_t - middle) / width  # type: ignore[no-any-return]
+
+    def output_scaling(self, t: Tensor | int, like: Tensor, moments: Moments | None) -> tuple[Tensor, ...]:
+        """E x_0, E x_t, and the factors of x_t - E x_t and of the output in x_0, for ``edm``."""
+        alpha, sigma = self.rates(t, like)
+        mean, std = self._moments(like, moments)
+        variance = alpha**2 * std**2 + sigma**2
+        return mean, alpha * mean, alpha * std**2 / variance, sigma * std / variance.sqrt()
+
+    def x0_from_output(
+        self, x_t: Tensor, t: Tensor | int, output: Tensor, moments: Moments | None = None,
+        scaling: tuple[Tensor, ...] | None = None,
+    ) -> Tensor:  # fmt: skip
         """The denoised scene x_0 that follows from a network output.
 
         ``edm``: skip and output scaling of Karras et al. (2022), Table 1, in variance-preserving
@@ -281,14 +313,14 @@ class GaussianProcess:
 
         ``moments``, here and in :meth:`target`, are mean and std that broadcast against ``x_t`` and scale the output.
         None takes those of all data. The input is always scaled by those of all data, because positions must stay
-        comparable.
+        comparable. ``scaling`` are numbers of :meth:`output_scaling` that are known already.
         """
-        alpha, sigma = self.rates(t, x_t)
         if self.prediction == "edm":
-            mean, std = self._moments(x_t, moments)
-            variance = alpha**2 * std**2 + sigma**2
-            skip = alpha * std**2 / variance
-            return mean + skip * (x_t - alpha * mean) + sigma * std / variance.sqrt() * output
+            if scaling is None and moments is None:
+                scaling = self.once(t, x_t, "output", lambda: self.output_scaling(t, x_t, None))
+            mean, middle, skip, gain = self.output_scaling(t, x_t, moments) if scaling is None else scaling
+            return mean + skip * (x_t - middle) + gain * output
+        alpha, sigma = self.rates(t, x_t)
         if self.prediction == "epsilon":
             return (x_t - sigma * output) / alpha
         if self.prediction == "v":
@@ -342,6 +374,13 @@ class GaussianProcess:
         Raises:
             InvalidInputError: ``eta`` is outside 0..1, or the stride is not within 0..T.
         """
+        x0_weight, xt_weight, std = self.posterior_weights(t, previous, residual, eta)
+        return x0_weight * x0 + xt_weight * x_t, std.to(x_t.device)
+
+    def posterior_weights(
+        self, t: int, previous: int, residual: Tensor | None = None, eta: float = 1.0
+    ) -> tuple[float, float, Tensor]:
+        """Weights of x_0 and of x_t in the mean of :meth:`posterior`, and its std; arguments and errors as there."""
         if not 0.0 <= eta <= 1.0:
             raise InvalidInputError(f"eta={eta} is outside 0..1: 1 is the ancestral chain, 0 the deterministic one")
         self.check_stride(t, previous)
@@ -352,7 +391,7 @@ class GaussianProcess:
         x0_weight = float(a_s.sqrt() - a_t.sqrt() * xt_weight)
         if residual is not None and previous > 0:
             variance = variance + (eta * x0_weight) ** 2 * residual.double().cpu()
-        return x0_weight * x0 + xt_weight * x_t, variance.sqrt().float().to(x_t.device)
+        return x0_weight, xt_weight, variance.sqrt().float()
 
     def estimate(self, t: int, previous: int, residual: ResidualVariance | None = None) -> tuple[float, Tensor]:
         """Weight of the denoised scene in the mean of x_s, s < t, and standard deviation (D,) of its error.
@@ -372,7 +411,8 @@ class GaussianProcess:
     def _moments(self, like: Tensor, moments: Moments | None) -> Moments:
         if moments is not None:
             return moments
-        return self.preconditioning.mean.to(like), self.preconditioning.std.to(like)
+        mean, std = (constant_on(x, like.device) for x in (self.preconditioning.mean, self.preconditioning.std))
+        return mean.to(like.dtype), std.to(like.dtype)
 
 
 def timestep_weights(distribution: str, schedule: NoiseSchedule, mean: float, std: float) -> Tensor:

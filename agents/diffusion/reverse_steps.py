@@ -10,7 +10,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from agents.diffusion.categorical import _TINY, draw_unmasked, inverted, systematic, unmasking_log_prob
+from agents.diffusion.categorical import (
+    _TINY,
+    draw_unmasked,
+    inverted,
+    one_hot,
+    systematic,
+    unmasking_log_prob,
+)
 
 
 class ReverseStep(Protocol):
@@ -168,6 +175,8 @@ class MixedStep(NamedTuple):
         cumulative = self.probs.double().cumsum(dim=-1)
         if self.masked is None:
             return inverted(cumulative, uniform)
+        if self.masked.device.type == "cpu" and not self.masked.any():
+            return self.probs.argmax(dim=-1)
         unmasked = draw_unmasked(self.masked, 1 - self.probs[..., -1], order)
         if self.groups is None:
             chosen = inverted(cumulative[..., :-1], uniform)
@@ -212,7 +221,7 @@ def _draw_grouped(probs: Tensor, groups: Tensor, uniform: Tensor, inner: Tensor)
 
 def one_hot_state(state: Tensor, probs: Tensor) -> Tensor:
     """(..., K) one-hot rows of states (...) in 0..K, with all zeros for the mask token K; dtype of ``probs``."""
-    return F.one_hot(state, probs.shape[-1])[..., :-1].to(probs.dtype)
+    return one_hot(state, probs.shape[-1] - 1, probs.dtype)
 
 
 def state_of(one_hot: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from agents.evaluation.measure import (
     prompt_following,
 )
 from agents.evaluation.physics_figures import physics_figures, stable_fraction
-from agents.evaluation.pictures import frechet_inception_distance, frechet_scene_distance, render_classifier_accuracy
+from agents.evaluation.pictures import frechet_scene_distance, render_classifier_accuracy
 
 __all__ = [
     "Accuracy",
@@ -19,7 +19,6 @@ __all__ = [
     "classifier_accuracy",
     "evaluate",
     "figure_table",
-    "frechet_inception_distance",
     "frechet_scene_distance",
     "grammar_scenes",
     "measure_samples",

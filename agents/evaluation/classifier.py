@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from agents.configuration.composition import require_at_least
 from agents.evaluation.set_network import SetNetwork, TypicalPlaces, blurred, scene_tokens
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch, check_same_assets
@@ -21,6 +22,11 @@ RESOLUTION = (1e-3, 1e-2)
 MAX_OBJECTS = 50_000
 """Largest number of objects to train on, both classes together; scenes of many objects cost more, and fewer suffice."""
 
+_TRAIN, _VALIDATION = (0.5, 1000), (0.15, 250)
+"""Share of the scenes of each class, and the largest number of them, with which a classifier is trained, and which
+decide when training stops; the rest is held out."""
+_LEARNING_RATE, _WEIGHT_DECAY = 4e-3, 0.02
+"""Largest rate of the one-cycle schedule of AdamW, and its weight decay."""
 _STOP_LOSS = 5e-3
 """Validation loss (nats) below which training stops, because the classifier separates the classes."""
 
@@ -51,44 +57,20 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class ClassifierConfig:
-    """Settings of the training and test of a classifier.
+    """Settings of the training of a classifier.
 
     Attributes:
-        train_fraction: share of training scenes in each class.
-        validation_fraction: share of validation scenes, which decide when training stops; the rest is held out.
-        max_train: largest number of training scenes of each class.
-        max_validation: largest number of validation scenes of each class.
         epochs: largest number of passes over the training part.
         patience: number of epochs without a better validation loss after which training stops.
         batch_size: number of scenes per step.
-        learning_rate: largest learning rate of the one-cycle schedule of AdamW.
-        weight_decay: weight decay of AdamW.
     """
 
-    train_fraction: float = 0.5
-    validation_fraction: float = 0.15
-    max_train: int = 1000
-    max_validation: int = 250
     epochs: int = 8
     patience: int = 3
     batch_size: int = 64
-    learning_rate: float = 4e-3
-    weight_decay: float = 0.02
 
     def __post_init__(self) -> None:
-        if self.train_fraction <= 0 or self.validation_fraction <= 0:
-            raise InvalidInputError(
-                f"train_fraction={self.train_fraction} and validation_fraction={self.validation_fraction} "
-                "must be positive"
-            )
-        if self.train_fraction + self.validation_fraction >= 1:
-            raise InvalidInputError(
-                f"train_fraction={self.train_fraction} and validation_fraction={self.validation_fraction} "
-                "leave nothing to hold out; their sum must be below 1"
-            )
-        for name in ("max_train", "max_validation", "epochs", "patience", "batch_size"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        require_at_least(self, 1, "epochs", "patience", "batch_size")
 
 
 @dataclass(frozen=True)
@@ -118,19 +100,20 @@ def check_classes(real: int, fake: int, seeds: int) -> None:
 
 
 def two_sample_accuracy(
-    real: int, fake: int, prepare: Prepare, *, seeds: int, seed: int, config: ClassifierConfig
-) -> Accuracy:
+    real: int, fake: int, prepare: Prepare, *, seeds: int, seed: int, config: ClassifierConfig | None,
+    max_train: int = _TRAIN[1],
+) -> Accuracy:  # fmt: skip
     """Train and test one classifier per seed, which ``prepare`` makes, each with a split, weights and order of its own.
     Rows 0 … real - 1 are real scenes, the following ``fake`` rows are samples. The larger class is subsampled to the
-    size of the smaller one.
+    size of the smaller one; at most ``max_train`` scenes of each class are for training.
     """
-    check_classes(real, fake, seeds)
+    config = config or ClassifierConfig()
     labels = torch.cat([torch.ones(real), torch.zeros(fake)])
     scores = []
     for number in range(seed, seed + seeds):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(number)
-            split = _split(real, fake, config)
+            split = _split(real, fake, max_train)
             network, forward = prepare(split)
             _train(network, forward, labels, split, config)
             right = (_logits(network, forward, split.held_out, config) > 0) == (labels[split.held_out] > 0.5)
@@ -138,11 +121,11 @@ def two_sample_accuracy(
     return Accuracy.of(scores)
 
 
-def _split(real: int, fake: int, config: ClassifierConfig) -> Split:
+def _split(real: int, fake: int, max_train: int) -> Split:
     count = min(real, fake)
     rows = [torch.randperm(real)[:count], real + torch.randperm(fake)[:count]]
-    train = min(round(config.train_fraction * count), config.max_train)
-    end = train + max(1, min(round(config.validation_fraction * count), config.max_validation))
+    train = min(round(_TRAIN[0] * count), max_train)
+    end = train + max(1, min(round(_VALIDATION[0] * count), _VALIDATION[1]))
     parts = (slice(train), slice(train, end), slice(end, None))
     return Split(*(torch.cat([of_class[part] for of_class in rows]) for part in parts))
 
@@ -150,8 +133,8 @@ def _split(real: int, fake: int, config: ClassifierConfig) -> Split:
 def _train(network: nn.Module, forward: Forward, labels: Tensor, split: Split, config: ClassifierConfig) -> None:
     """Leave the network with the weights of the epoch whose validation loss is lowest."""
     steps = math.ceil(len(split.train) / config.batch_size)
-    optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=config.weight_decay)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=config.epochs * steps)
+    optimizer = torch.optim.AdamW(network.parameters(), _LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=config.epochs * steps)
     best, best_state, since = math.inf, {name: value.clone() for name, value in network.state_dict().items()}, 0
     for _ in range(config.epochs):
         network.train()
@@ -204,7 +187,7 @@ def classifier_accuracy(
         seeds: number of repetitions with other splits and weights.
         seed: seed of the first repetition.
         resolution: standard deviation of the noise (m, rad); (0, 0) compares at full precision.
-        config: settings of the training and test; the classifier trains on at most 50,000 objects.
+        config: settings of the training, on at most 50,000 objects.
 
     Returns:
         Accuracy as a fraction; 0.5 is chance.
@@ -233,8 +216,6 @@ def classifier_accuracy(
 
         return network, forward
 
-    config = config or ClassifierConfig()
     per_scene = float(tokens.present.sum()) / len(tokens)
-    largest = max(MIN_SCENES, int(0.5 * MAX_OBJECTS / max(per_scene, 1.0)))
-    config = replace(config, max_train=min(config.max_train, largest))
-    return two_sample_accuracy(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config)
+    most = min(_TRAIN[1], max(MIN_SCENES, int(0.5 * MAX_OBJECTS / max(per_scene, 1.0))))
+    return two_sample_accuracy(len(real), len(fake), prepare, seeds=seeds, seed=seed, config=config, max_train=most)

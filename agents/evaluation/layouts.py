@@ -45,22 +45,13 @@ _WAVES = 12
 
 
 def spacing_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float | None:
-    """Distance of the distributions of distances between neighbours from those of real scenes, m.
+    """Distance of the distributions of distances between neighbours from those of real scenes of the same assets, m.
 
     For each ordered pair of assets (a, b), the horizontal distances from the free objects a to the nearest free object
     b at the same height form a distribution. The figure is the Wasserstein-1 distance of samples and reference, as a
     mean over the pairs, weighted by their number of distances in the reference. It shows whether objects are pushed
-    apart or crowded, even if their number and categories are those of real scenes.
-
-    Args:
-        batch: the samples.
-        reference: real scenes of the same assets.
-
-    Returns:
-        The distance in m; None if no pair of assets has 30 distances in both batches.
-
-    Raises:
-        InvalidInputError: the batches have other assets.
+    apart or crowded, even if their number and categories are those of real scenes. None if no pair of assets has 30
+    distances in both batches; an InvalidInputError if the batches have other assets.
 
     >>> spacing_wasserstein(SceneBatch.empty("dimsum_table", 3), SceneBatch.empty("dimsum_table", 5)) is None
     True
@@ -138,14 +129,10 @@ def nearest_scenes(batch: SceneBatch, others: SceneBatch, *, candidates: int = C
 
 
 def novelty(samples: Neighbors, real: Neighbors) -> float:
-    """Median distance of samples to their nearest training scene, over that of held-out real scenes.
+    """Median distance of samples to their nearest training scene, over that of held-out ``real`` scenes to theirs.
 
     At least 1 for samples that are as new as real scenes, 0 for copies; infinite when the held-out scenes are copies
     of training scenes themselves and the samples are not.
-
-    Args:
-        samples: nearest training scenes of the samples.
-        real: nearest training scenes of held-out real scenes, from the same training scenes.
     """
     above, below = float(samples.distance.median()), float(real.distance.median())
     return above / below if below > 0 else (1.0 if above == 0 else math.inf)
@@ -242,17 +229,10 @@ def tallest_stacks(batch: SceneBatch) -> Tensor:
 
 
 def stack_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
-    """Wasserstein-1 distance of the tallest stack per scene, in objects.
+    """Wasserstein-1 distance of the tallest stack per scene from that of real scenes of the same assets, in objects.
 
     It shows whether stacks are lower than in real scenes, even if the number and categories of objects are those of
-    real scenes.
-
-    Args:
-        batch: the samples, at least one.
-        reference: real scenes of the same assets, at least one.
-
-    Raises:
-        InvalidInputError: the batches have other assets.
+    real scenes. An InvalidInputError if the batches have other assets.
 
     >>> stack_wasserstein(SceneBatch.empty("dimsum_table", 3), SceneBatch.empty("dimsum_table", 5))
     0.0
@@ -277,20 +257,6 @@ class Support:
     riders: tuple[str, ...] | None = None  # names of the assets that can rest there; None means all free ones
     reach: float = 0.06  # largest horizontal distance (m) between the frames
     catch: float = 0.0  # height error (m) up to which a rider within reach is assigned here; for thin supports
-
-
-@dataclass(frozen=True)
-class Container:
-    """Hollow assets, in which objects lie as they fell; these objects have no correct height and are left out.
-
-    >>> [container.names for container in CONTAINERS]
-    [('fruit_bowl',), ('bowl',), ('utensil_crock',)]
-    """
-
-    names: tuple[str, ...]
-    riders: tuple[str, ...]  # objects that may lie in them
-    reach: float  # largest horizontal distance (m) between the frames
-    depth: float  # largest height (m) of the rider's frame above the container's; the smallest is 1 cm
 
 
 _FRUIT = (
@@ -349,12 +315,14 @@ SUPPORTS: dict[str, tuple[Support, ...]] = {
 }
 """Supports of each scene type, by name; scene types without an entry have no height figures."""
 
-CONTAINERS: tuple[Container, ...] = (
-    Container(("fruit_bowl",), _FRUIT, reach=0.11, depth=0.15),
-    Container(("bowl",), ("bread_slice",), reach=0.08, depth=0.10),
-    Container(("utensil_crock",), _UTENSILS, reach=0.10, depth=0.20),
+CONTAINERS = (
+    ("fruit_bowl", _FRUIT, 0.11, 0.15),
+    ("bowl", ("bread_slice",), 0.08, 0.10),
+    ("utensil_crock", _UTENSILS, 0.10, 0.20),
 )
-"""Containers of all scene types."""
+"""Hollow assets and the objects that may lie in them as they fell, which have no correct height and are left out; the
+largest horizontal distance (m) between the frames, and the largest height (m) of the object's frame above the
+container's. The smallest height is 1 cm."""
 
 
 def category_distribution(batch: SceneBatch, eps: float = KL_EPS) -> Tensor:
@@ -401,8 +369,14 @@ def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) 
         return {}
     errors: dict[str, list[Tensor]] = {support.kind: [] for support in supports}
     for start in range(0, len(batch), _CHUNK):
-        for kind, error in _chunk_errors(batch[start : start + _CHUNK], supports):
-            errors[kind].append(error)
+        chunk = batch[start : start + _CHUNK]
+        gaps = torch.stack([_height_gap(chunk, support) for support in supports])  # (S, B, N)
+        catch = torch.tensor([support.catch for support in supports]).to(gaps)[:, None, None]
+        nearest = (gaps - 1.0 * ((gaps <= catch) & (catch > 0))).argmin(dim=0)
+        error = gaps.gather(0, nearest[None])[0]
+        supported = torch.isfinite(error) & ~_contained(chunk)
+        for index, support in enumerate(supports):
+            errors[support.kind].append(error[supported & (nearest == index)])
     return {kind: torch.cat(parts) if parts else torch.empty(0) for kind, parts in errors.items()}
 
 
@@ -418,15 +392,6 @@ def out_of_workspace_rate(batch: SceneBatch) -> float:
     """Share of the free objects whose frame is outside the workspace; 0 where there are none."""
     free = batch.is_free
     return int((free & ~batch.in_workspace).sum()) / max(int(free.sum()), 1)
-
-
-def _chunk_errors(batch: SceneBatch, supports: Sequence[Support]) -> list[tuple[str, Tensor]]:
-    gaps = torch.stack([_height_gap(batch, support) for support in supports])  # (S, B, N)
-    catch = torch.tensor([support.catch for support in supports]).to(gaps)[:, None, None]
-    nearest = (gaps - 1.0 * ((gaps <= catch) & (catch > 0))).argmin(dim=0)
-    error = gaps.gather(0, nearest[None])[0]
-    supported = torch.isfinite(error) & ~_contained(batch)
-    return [(support.kind, error[supported & (nearest == index)]) for index, support in enumerate(supports)]
 
 
 def _height_gap(batch: SceneBatch, support: Support) -> Tensor:
@@ -457,11 +422,10 @@ def _contained(batch: SceneBatch) -> Tensor:
     z = batch.translations[..., 2].double()
     rise = z.unsqueeze(2) - z.unsqueeze(1)  # (B, rider, container)
     inside = torch.zeros_like(batch.is_empty)
-    for container in CONTAINERS:
-        if not set(container.names) & set(batch.scene_type.assets):
-            continue
-        held = _near(batch, container.names, container.reach) & (rise > 0.01) & (rise <= container.depth)
-        inside |= held.any(dim=-1) & _is_one_of(batch, container.riders)
+    for name, riders, reach, depth in CONTAINERS:
+        if name in batch.scene_type.assets:
+            held = _near(batch, (name,), reach) & (rise > 0.01) & (rise <= depth)
+            inside |= held.any(dim=-1) & _is_one_of(batch, riders)
     return inside
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -30,43 +30,28 @@ from agents.evaluation.layouts import (
 )
 from agents.evaluation.physics_figures import physics_figures, ready_figures, stability_figures
 from agents.evaluation.pictures import (
-    frechet_inception_distance,
     frechet_scene_distance,
     render_classifier_accuracy,
 )
+from scene_envs.datasets.prompts import KINDS, describe, parse_prompt, scene_facts
+from scene_envs.datasets.prompts.claims import NameCount, ObjectCount
 from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.protocols import PriorLike
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
 
-from collections.abc import Sequence
-
-from scene_envs.datasets.prompts import KINDS, PromptFacts, describe, parse_prompt, scene_facts
-from scene_envs.datasets.prompts.claims import NameCount, ObjectCount
-
 FLOOR_PREFIX = "floor_"
 """Prefix of the figures of real scenes measured against other real scenes."""
 CHANCE_PREFIX = "chance_"
 """Prefix of the figures of real scenes measured against prompts of other real scenes."""
-_PROMPT_FIGURES = {"count": "prompt_counts", "names": "prompt_names", "relations": "prompt_relations"}
 _FLOOR_SEED = 1_000_003
 """Added to the seed of the grammar for the second set of scenes."""
 
 Figures = dict[str, float]
-
-
-class Sampler(Protocol):
-    """Protocol of the priors that :func:`evaluate` takes, such as ``agents.priors.prior.ScenePrior``."""
-
-    @property
-    def scene_type(self) -> SceneType: ...
-
-    def sample(
-        self, count: int, *, num_steps: int = ..., slots: int | None = ..., seed: int = ..., batch_size: int = ...
-    ) -> SceneBatch: ...
 
 
 def measure_samples(
@@ -112,7 +97,7 @@ def measure_samples(
 
 
 def evaluate(
-    prior: Sampler | str,
+    prior: PriorLike | str,
     count: int = 500,
     reference: SceneBatch | None = None,
     *,
@@ -122,27 +107,25 @@ def evaluate(
     batch_size: int = 64,
     pool: PhysicsPool | None = None,
     ready: bool = True,
+    device: str = "auto",
 ) -> dict[str, float]:
-    """Sample a prior and measure its raw samples.
+    """Sample a prior and measure its raw samples: the figures of :func:`measure_samples`, and ``num_steps``.
 
     Args:
-        prior: a prior, or the name or path of one.
+        prior: a prior with a method ``sample``, or the name or path of one.
         count: number of samples.
         reference: real scenes; None draws ``count`` scenes from the grammar of the prior's scene type.
-        floor: other real scenes, see :func:`measure_samples`.
         num_steps: denoiser evaluations per sample.
         seed: seed of the samples, and of the grammar if it is used.
         batch_size: number of scenes denoised at once.
-        pool: worker processes for physics; None computes in this process.
-        ready: whether to also project and settle the samples.
-
-    Returns:
-        The figures of :func:`measure_samples`, and ``num_steps``.
+        floor, pool, ready: as for :func:`measure_samples`.
+        device: torch device of the network; ``"auto"`` is that of a prior that is given, and for a name the GPU where
+            torch finds one, else the CPU.
     """
-    sampler = cast(Sampler, resolve_prior(prior))
+    sampler: Any = resolve_prior(prior, device)
     if reference is None:
         reference = grammar_scenes(sampler.scene_type, count, seed=seed)
-    samples = sampler.sample(count, num_steps=num_steps, seed=seed, batch_size=batch_size)
+    samples = sampler.sample(count, num_steps=num_steps, seed=seed, batch_size=batch_size).to("cpu")
     figures = measure_samples(samples, reference, floor=floor, pool=pool, ready=ready)
     return {"num_steps": float(num_steps), **figures}
 
@@ -208,15 +191,9 @@ class RealScenes:
         """At most ``count`` held-out scenes in each of the two sets, and ``training`` training scenes, drawn at random
         from the dataset folders ``data``, joined by commas; empty takes fresh scenes of the grammar and no training
         scenes. ``heldout`` names folders too; empty takes the last scenes of ``data``, at most half of it. An
-        InvalidInputError for a folder that does not exist, scenes of another type, fewer than four held-out scenes, or
-        a number below 1; a CorruptFileError for a file that cannot be read, lacks a column, or holds rows that are not
-        scenes.
+        InvalidInputError for a folder that does not exist, scenes of another type, or fewer than four held-out scenes;
+        a CorruptFileError for a file that cannot be read, lacks a column, or holds rows that are not scenes.
         """
-        if count < 2 or training < 1:
-            raise InvalidInputError(
-                f"an evaluation needs count >= 2 and training_scenes >= 1, got count={count} and "
-                f"training_scenes={training}"
-            )
         if not data:
             if heldout:
                 raise InvalidInputError(f"heldout={heldout!r} needs data=, the folder of the training scenes")
@@ -316,7 +293,6 @@ class EvaluationInputs:
     follow: Callable[[list[str]], SceneBatch] | None = None  # samples a scene per prompt; None without prompts
     pool: PhysicsPool | None = None  # None computes in this process
     seed: int = 0  # of the classifiers and prompts
-    fid_weights: str = ""  # path of the weights of an Inception-v3
     prompts: int | None = None  # number of real scenes whose prompts the samples follow; None for all
     left_out: dict[str, str] = field(default_factory=dict)  # gets figures that this machine cannot compute, and why
 
@@ -343,15 +319,6 @@ def _accuracy(name: str, classify: Callable[..., Accuracy], inputs: EvaluationIn
         return {name: accuracy.mean, f"{name}_std": accuracy.std}
 
     return _with_floor(measure, inputs)
-
-
-def _fid(inputs: EvaluationInputs) -> Figures:
-    if not inputs.fid_weights:
-        raise InvalidInputError("FID needs fid_weights=, the path of an Inception-v3's weights")
-    real, weights = inputs.real.reference, inputs.fid_weights
-    return _with_floor(
-        lambda batch: {"frechet_inception_distance": frechet_inception_distance(batch, real, weights)}, inputs
-    )
 
 
 def _prompts(inputs: EvaluationInputs) -> Figures:
@@ -392,13 +359,9 @@ MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
     "prompts": _prompts,
     "classifier": lambda inputs: _accuracy("classifier_accuracy", classifier_accuracy, inputs),
     "renders": lambda inputs: _accuracy("render_accuracy", render_classifier_accuracy, inputs),
-    "fid": _fid,
 }
 """Groups of measures, in the order in which they are computed: cheap ones first."""
 
-
-_NOT_SHOWN = frozenset({"category_kl"})
-"""Figures that the table leaves out, because they are shown under another name, in units of 1e-4."""
 
 READING: dict[str, str] = {
     "num_steps": "denoiser evaluations per sample",
@@ -441,7 +404,6 @@ READING: dict[str, str] = {
     "render_accuracy": "accuracy of a CNN on their semantic renders; 0.5 is chance, lower is better",
     "render_accuracy_std": "its spread over the seeds",
     "frechet_scene_distance": "FSD, on features of a frozen set encoder (no FID); lower is better",
-    "frechet_inception_distance": "FID of semantic renders; lower is better",
     "prompt_guidance": "weight of classifier-free guidance of the samples with prompts; 0 for none",
     "prompt_following": "samples of which every claim of their prompt is true; higher is better",
     r"prompt_(counts|names|relations)": "the same among prompts on {}",
@@ -467,7 +429,7 @@ def figure_table(figures: Mapping[str, float]) -> str:
     """
     lines = ["| figure | samples | real | how to read |", "|---|---|---|---|"]
     for name, value in figures.items():
-        if name.startswith(FLOOR_PREFIX) or name in _NOT_SHOWN:
+        if name.startswith(FLOOR_PREFIX) or name == "category_kl":  # shown as category_kl_e4
             continue
         cells = (name, _number(value), _number(figures.get(FLOOR_PREFIX + name)), how_to_read(name))
         if name.startswith(CHANCE_PREFIX):  # a figure of real scenes, shown in their column
@@ -496,14 +458,10 @@ def _number(value: float | None) -> str:
 
 
 def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, float]:
-    """Share of scenes that follow their own prompt.
+    """Share of B scenes that follow their own one of B prompts, the paper's prompt-following accuracy.
 
-    This is the paper's prompt-following accuracy. A prompt is followed if every claim in it is true of the scene. The
-    numbers of the named objects must be exact. Relations have the tolerances in docs/prompts.md.
-
-    Args:
-        batch: B scenes.
-        prompts: B prompts that :func:`~scene_envs.datasets.parse_prompt` reads.
+    A prompt is followed if every claim in it is true of the scene. The numbers of the named objects must be exact.
+    Relations have the tolerances in docs/prompts.md.
 
     Returns:
         ``prompt_following``: share of all prompts followed. ``prompt_counts``, ``prompt_names`` and
@@ -522,17 +480,16 @@ def prompt_following(batch: SceneBatch, prompts: Sequence[str]) -> dict[str, flo
     if len(prompts) != len(batch) or not prompts:
         raise InvalidInputError(f"{len(prompts)} prompts for {len(batch)} scenes; give one prompt per scene")
     asked = [parse_prompt(prompt, batch.scene_type) for prompt in prompts]
-    followed: dict[str, list[bool]] = {kind: [] for kind in KINDS}
-    scores = []
-    for prompt, scene in zip(asked, scene_facts(batch), strict=True):
-        checks = prompt.check(scene)
-        followed[kind_of(prompt)].append(all(check.holds for check in checks))
-        scores.append(np.mean([check.score for check in checks]))
-    figures = {"prompt_following": float(np.mean([holds for kind in followed.values() for holds in kind]))}
-    for kind, holds in followed.items():
-        if holds:
-            name = _PROMPT_FIGURES[kind]
-            figures |= {name: float(np.mean(holds)), f"{name}_number": float(len(holds))}
+    checks = [prompt.check(scene) for prompt, scene in zip(asked, scene_facts(batch), strict=True)]
+    followed = np.array([all(check.holds for check in each) for each in checks])
+    first = [prompt.claims[0] for prompt in asked]
+    counts = np.array([isinstance(claim, ObjectCount) for claim in first])
+    names = np.array([isinstance(claim, NameCount) for claim in first])
+    figures = {"prompt_following": float(followed.mean())}
+    for kind, rows in {"counts": counts, "names": names, "relations": ~(counts | names)}.items():
+        if rows.any():
+            figures |= {f"prompt_{kind}": float(followed[rows].mean()), f"prompt_{kind}_number": float(rows.sum())}
+    scores = [np.mean([check.score for check in each]) for each in checks]
     return {**figures, "prompt_score": float(np.mean(scores))}
 
 
@@ -562,9 +519,3 @@ def own_prompts(batch: SceneBatch, seed: int = 0) -> list[str]:
     for turn, kind in enumerate(KINDS[: len(batch)]):
         prompts[turn :: len(KINDS)] = describe(batch[turn :: len(KINDS)], rng, kinds=[kind])
     return prompts
-
-
-def kind_of(prompt: PromptFacts) -> str:
-    """Kind of a prompt, one of :data:`~scene_envs.datasets.prompts.KINDS`."""
-    first = prompt.claims[0]
-    return "count" if isinstance(first, ObjectCount) else "names" if isinstance(first, NameCount) else "relations"

@@ -12,18 +12,14 @@ from agents.networks.baselines import (
 )
 from agents.networks.flux import FluxConfig, FluxDenoiser, MixedFlux, MixedFluxConfig
 from agents.networks.registry import (
-    NETWORKS,
     build_network,
     list_networks,
-    match_parameters,
     network_config,
-    parameter_count,
     register_network,
 )
 from agents.networks.text import TextConfig, TextEncoder
 
 __all__ = [
-    "NETWORKS",
     "DiffuScene",
     "DiffuSceneConfig",
     "FluxConfig",
@@ -40,8 +36,6 @@ __all__ = [
     "TextEncoder",
     "build_network",
     "list_networks",
-    "match_parameters",
     "network_config",
-    "parameter_count",
     "register_network",
 ]

@@ -4,19 +4,13 @@ The *trunk* between inputs and outputs maps tokens (B, N, H), a time embedding (
 (B, 1, 1, L), both None without text, to tokens (B, N, H).
 
 MiDiffusion (Hu et al. 2024, "Mixed Diffusion for 3D Indoor Scene Synthesis", section on the denoising network) is a
-transformer over the objects of a scene, without positional encoding. Each object is a token, made of the embedding of
-its category and an MLP of its pose. Every block has self-attention among objects, cross-attention to the condition and
-a feed-forward layer, each behind a layer norm whose scale and shift are functions of time. Separate heads predict
-categories and poses. The paper's condition is a floor plan; here it is text, as in the comparison of Pfaff et al. (CoRL
-2025).
+transformer over the objects of a scene, without positional encoding, whose layer norms are functions of time. The
+paper's condition is a floor plan; here it is text, as in the comparison of Pfaff et al. (CoRL 2025).
 
 DiffuScene (Tang et al. 2024, "DiffuScene: Denoising Diffusion Models for Generative Indoor Scene Synthesis", section on
-the denoising network) is a U-Net of 1-D convolutions along the slots of a scene. MLPs that all objects share encode
-their attributes to channels and decode them. Between encoder and decoder there are residual blocks of convolutions, to
-which the time embedding is added. Each level has attention among slots and, with text, from slots to words. As in the
-U-Net of Ho et al. 2020, convolutions of stride 2 halve the resolution on the way down, and skip connections lead from
-each level on the way down to that on the way up. Convolutions mix neighbouring slots, so the network depends on the
-order of slots, although scenes have no order.
+the denoising network) is a U-Net of 1-D convolutions along the slots of a scene (Ho et al. 2020), with attention among
+slots and, with text, from slots to words at each level. Convolutions mix neighbouring slots, so the network depends on
+the order of slots, although scenes have no order.
 """
 
 from __future__ import annotations
@@ -30,7 +24,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.networks.flux import timestep_embedding
-from agents.networks.flux_modules import FourierFeatures
 from agents.networks.registry import register_network
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import POSE_FEATURES
@@ -45,14 +38,12 @@ class BaselineConfig:
     Attributes:
         hidden: width of the tokens; a multiple of ``heads``.
         heads: attention heads.
-        text_width: width of the text tokens; 0 for none.
-        frequencies: octaves of Fourier features of each translation, damped by the noise; 0 for none, as published.
+        text_width: width of the text tokens; 0 for none, as in continuous networks.
     """
 
     hidden: int = 128
     heads: int = 4
     text_width: int = 0
-    frequencies: int = 0
 
     def __post_init__(self) -> None:
         for name in ("hidden", "heads", "depth", "levels", "blocks"):
@@ -61,11 +52,6 @@ class BaselineConfig:
         if self.hidden % self.heads:
             raise InvalidInputError(f"hidden={self.hidden} is not a multiple of heads={self.heads}")
 
-    @property
-    def time_input(self) -> str:
-        """The number that is embedded as time; see :class:`~agents.networks.MixedFluxConfig`."""
-        return "log_noise" if self.frequencies else "timestep"
-
 
 @dataclass(frozen=True, kw_only=True)
 class MixedBaselineConfig(BaselineConfig):
@@ -73,13 +59,9 @@ class MixedBaselineConfig(BaselineConfig):
 
     Attributes:
         categories: K = C + 1, assets and *empty*; the mask token is one more.
-        time_scale: factor on timesteps before they are embedded.
-        flags: 1 to tell the network which poses and categories are observed (inpainting), 0 as published.
     """
 
     categories: int
-    time_scale: float = 1.0
-    flags: int = 1
 
 
 class Attention(nn.Module):
@@ -128,7 +110,6 @@ class _Baseline(nn.Module):
         self.time_in = mlp(_TIME_WIDTH, hidden, hidden)
         self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None
         self.trunk = trunk
-        self.fourier = FourierFeatures(config.frequencies)
 
     def _tokens(self, tokens: Tensor, time: Tensor, text: Tensor | None, text_mask: Tensor | None) -> Tensor:
         """Tokens (B, N, H) through the trunk; ``time`` (B,)."""
@@ -144,39 +125,20 @@ class _Baseline(nn.Module):
             mask = (text_mask | ~somewhere)[:, None, None]  # a row of padding alone is read as no text
         return self.trunk(tokens, condition, self.text_in(text), mask)
 
-    def _with_octaves(self, features: Tensor, position: Tensor | None, noise_level: Tensor | None) -> Tensor:
-        """Features (B, N, D), with Fourier features of the translations appended where the network has any."""
-        if not self.config.frequencies:
-            return features
-        if position is None or noise_level is None:
-            raise InvalidInputError("a network with Fourier features needs position= and noise_level=")
-        return torch.cat([features, self.fourier(position, noise_level)], dim=-1)
-
 
 class ContinuousBaseline(_Baseline):
     """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D), which starts at zero."""
 
     def __init__(self, config: BaselineConfig, features: int, trunk: nn.Module) -> None:
         super().__init__(config, trunk)
-        self.scene_in = mlp(features + 6 * config.frequencies, config.hidden, config.hidden)
+        self.scene_in = mlp(features, config.hidden, config.hidden)
         self.scene_out = head(config.hidden, features)
 
-    def forward(
-        self, x: Tensor, position: Tensor, noise_level: Tensor, *, text: Tensor | None = None,
-        text_mask: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
-        """Predict.
-
-        Args:
-            x: (B, N, D) network input, unit variance.
-            position: (B, N, D) the scene in signal units; its first three features are read, for Fourier features.
-            noise_level: (B,) noise-to-signal ratio of ``position``; its logarithm is the time that is embedded.
-            text: (B, L, W) text tokens; None for no text.
-            text_mask: (B, L) bool, True for real tokens.
+    def forward(self, x: Tensor, position: Tensor, noise_level: Tensor) -> Tensor:
+        """Predict from (B, N, D) network input of unit variance and the noise-to-signal ratio (B,), whose logarithm is
+        embedded as time; ``position``, the scene in signal units, is not read.
         """
-        levels = noise_level[:, None].expand(x.shape[:2])
-        tokens = self.scene_in(self._with_octaves(x, position, levels))
-        return self.scene_out(self._tokens(tokens, 250.0 * noise_level.log(), text, text_mask))
+        return self.scene_out(self._tokens(self.scene_in(x), 250.0 * noise_level.log(), None, None))
 
 
 class MixedBaseline(_Baseline):
@@ -185,12 +147,10 @@ class MixedBaseline(_Baseline):
     def __init__(self, config: MixedBaselineConfig, trunk: nn.Module) -> None:
         super().__init__(config, trunk)
         hidden = config.hidden
-        self.time_scale = config.time_scale
-        self.pose_in = mlp(POSE_FEATURES + 6 * config.frequencies, hidden, hidden)
+        self.pose_in = mlp(POSE_FEATURES, hidden, hidden)
         self.category_in = nn.Embedding(config.categories + 1, hidden)
-        self.given_in = nn.Embedding(4, hidden) if config.flags else None
-        if self.given_in is not None:
-            nn.init.zeros_(self.given_in.weight)
+        self.given_in = nn.Embedding(4, hidden)
+        nn.init.zeros_(self.given_in.weight)
         self.pose_out = head(hidden, POSE_FEATURES)
         self.logits_out = head(hidden, config.categories)
 
@@ -200,10 +160,10 @@ class MixedBaseline(_Baseline):
         observed: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Predict; arguments and results as in :meth:`agents.networks.flux.MixedFlux.forward`."""
-        tokens = self.pose_in(self._with_octaves(pose, position, noise_level)) + self.category_in(states)
-        if self.given_in is not None and observed is not None:
+        tokens = self.pose_in(pose) + self.category_in(states)
+        if observed is not None:
             tokens = tokens + self.given_in(observed)
-        tokens = self._tokens(tokens, time * self.time_scale, text, text_mask)
+        tokens = self._tokens(tokens, time, text, text_mask)
         return self.pose_out(tokens), self.logits_out(tokens)
 
 
@@ -213,7 +173,6 @@ class MixedBaseline(_Baseline):
 @dataclass(frozen=True, kw_only=True)
 class _MiDiffusionSize(BaselineConfig):
     depth: int = 6
-    mlp_ratio: float = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,7 +184,6 @@ class MiDiffusionConfig(_MiDiffusionSize):
     Attributes:
         features: D, numbers per slot.
         depth: number of blocks.
-        mlp_ratio: width of the feed-forward layers over ``hidden``.
     """
 
     features: int
@@ -261,7 +219,7 @@ class _Block(nn.Module):
         self.attention = Attention(hidden, config.heads)
         self.text_norm = _AdaptiveNorm(hidden) if config.text_width else None
         self.text_attention = Attention(hidden, config.heads) if config.text_width else None
-        self.feed = mlp(hidden, round(hidden * config.mlp_ratio), hidden)
+        self.feed = mlp(hidden, 4 * hidden, hidden)
 
     def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
         normal = self.norm(tokens, condition)
@@ -319,12 +277,6 @@ class _DiffuSceneSize(BaselineConfig):
     hidden: int = 64
     levels: int = 4
     blocks: int = 2
-    inner_ratio: float = 1.0
-
-    @property
-    def inner(self) -> int:
-        """Channels between the two convolutions of a residual block, a multiple of ``heads``."""
-        return max(1, round(self.hidden * self.inner_ratio / self.heads)) * self.heads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -337,7 +289,6 @@ class DiffuSceneConfig(_DiffuSceneSize):
         levels: resolutions along the slots, each half of the one before.
         blocks: residual blocks per level, on the way down and again on the way up.
         heads: attention heads, and groups of the group norms.
-        inner_ratio: channels between the two convolutions of a residual block, over ``hidden``.
     """
 
     features: int
@@ -353,12 +304,12 @@ class _Residual(nn.Module):
 
     def __init__(self, config: _DiffuSceneSize, channels: int) -> None:
         super().__init__()
-        hidden, inner = config.hidden, config.inner
+        hidden = config.hidden
         self.norm = nn.GroupNorm(config.heads, channels)
-        self.convolution = nn.Conv1d(channels, inner, 3, padding=1)
-        self.time = nn.Linear(hidden, inner)
-        self.inner_norm = nn.GroupNorm(config.heads, inner)
-        self.out = nn.Conv1d(inner, hidden, 3, padding=1)
+        self.convolution = nn.Conv1d(channels, hidden, 3, padding=1)
+        self.time = nn.Linear(hidden, hidden)
+        self.inner_norm = nn.GroupNorm(config.heads, hidden)
+        self.out = nn.Conv1d(hidden, hidden, 3, padding=1)
         self.skip = nn.Conv1d(channels, hidden, 1) if channels != hidden else nn.Identity()
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
@@ -462,17 +413,11 @@ class MixedDiffuScene(MixedBaseline):
 # -- registration ---------------------------------------------------------------------------------
 
 
-def _midiffusion(keys: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: keys[name] for name in ("hidden", "depth", "heads", "text_width")}
-
-
 def _diffuscene(keys: Mapping[str, Any]) -> dict[str, Any]:
     return {**{name: keys[name] for name in ("hidden", "heads", "text_width")}, "blocks": max(1, keys["depth"] // 3)}
 
 
-register_network("midiffusion", "continuous", MiDiffusionConfig, MiDiffusion, ratio="mlp_ratio", sizes=_midiffusion)
-register_network(
-    "midiffusion", "mixed", MixedMiDiffusionConfig, MixedMiDiffusion, ratio="mlp_ratio", sizes=_midiffusion
-)
-register_network("diffuscene", "continuous", DiffuSceneConfig, DiffuScene, ratio="inner_ratio", sizes=_diffuscene)
-register_network("diffuscene", "mixed", MixedDiffuSceneConfig, MixedDiffuScene, ratio="inner_ratio", sizes=_diffuscene)
+register_network("midiffusion", "continuous", MiDiffusionConfig, MiDiffusion)
+register_network("midiffusion", "mixed", MixedMiDiffusionConfig, MixedMiDiffusion)
+register_network("diffuscene", "continuous", DiffuSceneConfig, DiffuScene, sizes=_diffuscene)
+register_network("diffuscene", "mixed", MixedDiffuSceneConfig, MixedDiffuScene, sizes=_diffuscene)

@@ -2,20 +2,161 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from agents.diffusion import CategoricalProcess, GaussianProcess
+from agents.diffusion.categorical import one_hot
 from agents.diffusion.gaussian import Moments
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.text import Text, TextEncoder
 from agents.networks.text_encoders import BertEncoder
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import POSE_FEATURES
+
+_LOGGER = logging.getLogger(__name__)
+
+PRECISIONS = ("float32", "tf32", "bfloat16")
+"""Number formats of the products in the blocks of a network, while a chain is sampled."""
+_FINE = 0.1
+"""Noise-to-signal ratio up to which steps are always in float32: the error of a step is a share of its noise."""
+
+
+def check_precision(name: str, device: torch.device) -> None:
+    """Raise UnknownNameError for another name, and InvalidInputError for a precision that ``device`` lacks."""
+    if name not in PRECISIONS:
+        raise unknown_name("precision", name, PRECISIONS)
+    recent = device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
+    if name == "float32" or recent or (name == "bfloat16" and device.type == "cpu"):
+        return
+    raise InvalidInputError(
+        f"precision={name!r} is not possible on device={str(device)!r}: tf32 needs an NVIDIA GPU of compute capability "
+        "8.0 or higher, bfloat16 such a GPU or a CPU; use precision=float32"
+    )
+
+
+@contextmanager
+def products_in(precision: str, like: Tensor) -> Iterator[None]:
+    """The context in which products on the device of ``like`` are in ``precision``, one of :data:`PRECISIONS`."""
+    if precision == "bfloat16":
+        with torch.autocast(like.device.type, torch.bfloat16):
+            yield
+        return
+    before = torch.get_float32_matmul_precision()
+    if precision == "tf32":
+        torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        if precision == "tf32":
+            torch.set_float32_matmul_precision(before)
+
+
+# -- CUDA graphs ----------------------------------------------------------------------------------
+
+
+_CAPTURED_AT = 3
+"""Call of a layout that is captured: the first calls of a chain may be the only ones."""
+_MAX_GRAPHS = 48
+"""Layouts that are captured; calls of further ones launch their kernels one by one."""
+
+Capture = Callable[[Callable[[], Any], Any], tuple[Callable[[], None], Any]]
+"""``(call, pool) -> replay, outputs``: ``replay()`` repeats ``call`` on the same memory and fills ``outputs``."""
+
+
+def capture_graph(call: Callable[[], Any], pool: Any) -> tuple[Callable[[], None], Any]:
+    """A CUDA graph of ``call``, with memory of ``pool``."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(2):
+            call()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, pool=pool):
+        outputs = call()
+    return graph.replay, outputs
+
+
+class Replays:
+    """Calls of a network that are captured as CUDA graphs and replayed, one graph for each layout of the inputs.
+
+    A chain calls the network with the same layout step by step; on a GPU, launching its several hundred kernels one by
+    one takes longer than computing them. Weights are read where they lie, so training may go on between calls. Calls
+    with gradients, and on other devices, are plain. If a network cannot be captured, or its graph gives other values,
+    a warning says so once, and all its calls are plain from then on.
+
+    Args:
+        capture: makes the graph of a call.
+        on: type of the devices whose calls are captured.
+    """
+
+    def __init__(self, capture: Capture = capture_graph, on: str = "cuda") -> None:
+        self._capture, self._on = capture, on
+        self._known: dict[Any, Any] = {}  # calls so far, or inputs, replay and outputs
+        self._pool: Any = None
+        self._fails = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Replays, (self._capture, self._on)  # a copy captures its own network
+
+    def run(self, network: nn.Module, *inputs: Tensor, **named: Tensor | None) -> Any:
+        """``network(*inputs, **named)``: a tensor or a tuple of tensors."""
+        if inputs[0].device.type != self._on or self._fails or torch.is_grad_enabled():
+            return network(*inputs, **named)
+        given = [*inputs, *named.values()]
+        layout = tuple((value.shape, value.dtype) if isinstance(value, Tensor) else value for value in given)
+        weights = tuple(weight.data_ptr() for weight in network.parameters())
+        key = tuple(named), layout, inputs[0].device, getattr(network, "body_precision", ""), weights
+        if (
+            len(self._known) >= 4 * _MAX_GRAPHS and key not in self._known
+        ):  # weights that were replaced, and their graphs
+            self._known.clear()
+        known = self._known.setdefault(key, 0)
+        if isinstance(known, int):
+            self._known[key] = known + 1
+            if (
+                known + 1 < _CAPTURED_AT
+                or sum(not isinstance(entry, int) for entry in self._known.values()) >= _MAX_GRAPHS
+            ):
+                return network(*inputs, **named)
+            known = self._captured(network, inputs, named)
+            if known is None:
+                return network(*inputs, **named)
+            self._known[key] = known
+        kept, replay, outputs = known
+        for place, value in zip(kept, given, strict=True):
+            if isinstance(value, Tensor):
+                place.copy_(value)
+        replay()
+        return outputs.clone() if isinstance(outputs, Tensor) else tuple(output.clone() for output in outputs)
+
+    def _captured(self, network: nn.Module, inputs: Sequence[Tensor], named: dict[str, Tensor | None]) -> Any:
+        """Inputs, replay and outputs of a captured call; None if it cannot be captured."""
+        own = [value.clone() for value in inputs]
+        others = {name: None if value is None else value.clone() for name, value in named.items()}
+        try:
+            if self._pool is None and self._on == "cuda":
+                self._pool = torch.cuda.graph_pool_handle()  # one memory for all graphs: no two run at once
+            replay, outputs = self._capture(lambda: network(*own, **others), self._pool)
+            replay()
+            pair = [(value,) if isinstance(value, Tensor) else value for value in (outputs, network(*own, **others))]
+            if not all(torch.allclose(a, b, 1e-2, 1e-3) for a, b in zip(*pair, strict=True)):
+                raise RuntimeError("the graph gives other values than the network")
+        except Exception as error:  # what an operation raises during a capture is up to it
+            self._fails, name = True, type(network).__name__
+            _LOGGER.warning(
+                "%s cannot be captured as a CUDA graph, so its kernels are launched one by one: %s", name, error
+            )
+            return None
+        return [*own, *others.values()], replay, outputs
 
 
 def autocast(like: Tensor, precision: torch.dtype) -> torch.autocast:
@@ -27,27 +168,59 @@ class Denoiser(nn.Module):
     """A network together with its process: x_t (B, N, D) and t (B,) to the denoised scene x_0 (B, N, D).
 
     Attributes:
-        precision: number format of the network alone (``torch.bfloat16`` for autocast); the chain is always float32.
+        precision: number format of the network in training (``torch.bfloat16`` for autocast); the chain is always
+            float32.
+        chain_precision: number format of the blocks in a chain, see :meth:`ScenePrior.with_precision`.
     """
 
     def __init__(self, network: nn.Module, process: GaussianProcess) -> None:
         super().__init__()
         self.network = network
         self.process = process
-        self.precision = torch.float32
+        self.precision, self.chain_precision = torch.float32, "float32"
+        self.replays = Replays()
 
-    def output(self, x_t: Tensor, t: Tensor) -> Tensor:
+    def output(self, x_t: Tensor, t: Tensor | int) -> Tensor:
         """The raw network output (B, N, D), in the units of ``process.target``."""
         process = self.process
         alpha, _ = process.rates(t, x_t)
-        level = (process.sigma[t.cpu()] / process.alpha[t.cpu()]).to(x_t.device)
+        level = noise_levels(process, t, x_t)
+        set_precision(self, process, t)
+        inputs = process.network_input(x_t, t), x_t / alpha, level
         with autocast(x_t, self.precision):
-            result: Tensor = self.network(process.network_input(x_t, t), x_t / alpha, level)
-        return result.to(x_t.dtype)
+            results = [
+                self.replays.run(self.network, *(value[rows] for value in inputs)) for rows in parts_of(*x_t.shape[:2])
+            ]
+        return torch.cat(results).to(x_t.dtype)
 
-    def forward(self, x_t: Tensor, t: Tensor) -> Tensor:
-        """The denoised scene x_0 (B, N, D), normalised."""
+    def forward(self, x_t: Tensor, t: Tensor | int) -> Tensor:
+        """The denoised scene x_0 (B, N, D), normalised; ``t`` (B,), or one timestep of all scenes."""
         return self.process.x0_from_output(x_t, t, self.output(x_t, t))
+
+
+def noise_levels(process: GaussianProcess, t: Tensor | int, like: Tensor) -> Tensor:
+    """(B,) noise-to-signal ratio of scenes ``like`` (B, N, D) at ``t``."""
+    alpha, sigma = process.rates(t, like)
+    ratio = sigma / alpha
+    return ratio.reshape(t.shape) if isinstance(t, Tensor) else ratio.expand(len(like))
+
+
+def set_precision(denoiser: Any, process: GaussianProcess, t: Tensor | int) -> None:
+    """Tell the network of a denoiser the precision of its blocks at ``t``: that of chains at one noisy timestep."""
+    if hasattr(denoiser.network, "body_precision"):
+        noisy = isinstance(t, int) and float(process.sigma[t]) > _FINE * float(process.alpha[t])
+        denoiser.network.body_precision = denoiser.chain_precision if noisy else "float32"
+
+
+_PAIRS = 2**20
+"""Pairs of slots that a network reads at once: features of more would not make a device faster, but fill its memory."""
+
+
+def parts_of(count: int, slots: int) -> list[slice]:
+    """Rows of the parts of ``count`` scenes that a network reads at once; one part where gradients are recorded."""
+    parts = 1 if torch.is_grad_enabled() else min(count, -(-count * slots**2 // _PAIRS))
+    bounds = [count * part // max(1, parts) for part in range(max(1, parts) + 1)]
+    return [slice(*pair) for pair in pairwise(bounds)]
 
 
 EMPTY_SLOTS = ("attended", "dropped")
@@ -93,7 +266,9 @@ class MixedDenoiser(nn.Module):
     """x_t (B, N, 12 + K) and t (B,) to the clean pose (B, N, 12) and logits of the clean category (B, N, K).
 
     Attributes:
-        precision: number format of the network alone (``torch.bfloat16`` for autocast); chains are always float32.
+        precision: number format of the network in training (``torch.bfloat16`` for autocast); chains are always
+            float32.
+        chain_precision: number format of the blocks in a chain, see :meth:`ScenePrior.with_precision`.
     """
 
     def __init__(
@@ -121,7 +296,8 @@ class MixedDenoiser(nn.Module):
         self.register_buffer("_std", std, persistent=False)
         self.network = network
         self.reads_log_noise = getattr(network.config, "time_input", "timestep") == "log_noise"
-        self.precision = torch.float32
+        self.precision, self.chain_precision = torch.float32, "float32"
+        self.replays = Replays()
         self.text_encoder = text_encoder
         self.poses = poses
         self.categories = categories
@@ -141,35 +317,44 @@ class MixedDenoiser(nn.Module):
         return self._mean[t[:, None], states], self._std[t[:, None], states]
 
     def output(
-        self, x_t: Tensor, t: Tensor, observed: Observed | None = None, text: Text | None = None
+        self, x_t: Tensor, t: Tensor | int, observed: Observed | None = None, text: Text | None = None
     ) -> tuple[Tensor, Tensor]:
         """The raw pose output, in the units of ``poses.target``, and logits.
 
         Args:
             x_t: (B, N, 12 + K), observed entries in place.
-            t: (B,) timesteps.
+            t: (B,) timesteps, or one of all scenes.
             observed: entries that carry no noise.
             text: (B, L, W) tokens and (B, L) their mask.
         """
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
         alpha, _ = self.poses.rates(t, pose)
-        ratio = (self.poses.sigma[t.cpu()] / self.poses.alpha[t.cpu()]).to(x_t.device)
+        ratio = noise_levels(self.poses, t, x_t)
         level = ratio[:, None].expand(pose.shape[:2])
         scaled = self.poses.network_input(pose, t)
         position = pose / alpha
         if observed is not None:
             exact = observed.pose[..., None]
-            scaled = torch.where(exact, self.poses.network_input(pose, torch.zeros_like(t)), scaled)
+            scaled = torch.where(
+                exact, self.poses.network_input(pose, torch.zeros_like(t) if isinstance(t, Tensor) else 0), scaled
+            )
             position = torch.where(exact, pose, position)
             level = torch.where(observed.pose, torch.zeros_like(level), level)
-        time = 250.0 * ratio.log() if self.reads_log_noise else (t - 1).to(pose.dtype)
+        steps = t if isinstance(t, Tensor) else torch.full((len(pose),), t, device=pose.device)
+        time = 250.0 * ratio.log() if self.reads_log_noise else (steps - 1).to(pose.dtype)
         inputs = [scaled, states, position, level, *([] if observed is None else [observed.flags()])]
+        set_precision(self, self.poses, t)
         if self.drops_empty:
             output, logits = self._on_present(inputs, time, text)
             count = self.categories.categories
-            certain = _CERTAIN * (F.one_hot(states.clamp(max=count - 1), count).float() - 1.0)
+            certain = _CERTAIN * (one_hot(states, count, logits.dtype) - 1.0)
             return output, torch.where((states < count)[..., None], certain, logits)
-        return self._run(inputs, time, text)
+        results = []
+        for rows in parts_of(*pose.shape[:2]):
+            words = None if text is None else (text[0][rows], text[1][rows])
+            results.append(self._run([value[rows] for value in inputs], time[rows], words))
+        output, logits = (torch.cat(side) for side in zip(*results, strict=True))
+        return output, logits
 
     def _run(
         self, inputs: Sequence[Tensor], time: Tensor, text: Text | None, slot_mask: Tensor | None = None
@@ -179,8 +364,8 @@ class MixedDenoiser(nn.Module):
         tokens, mask = (None, None) if text is None else text
         extra = {} if slot_mask is None else {"slot_mask": slot_mask}
         with autocast(scaled, self.precision):
-            output, logits = self.network(
-                scaled, states, time, text=tokens, text_mask=mask, position=position, noise_level=level,
+            output, logits = self.replays.run(
+                self.network, scaled, states, time, text=tokens, text_mask=mask, position=position, noise_level=level,
                 observed=flags[0] if flags else None, **extra,
             )  # fmt: skip
         return output.to(scaled.dtype), logits.to(scaled.dtype)
@@ -197,19 +382,28 @@ class MixedDenoiser(nn.Module):
         return run_packed(present, run, (POSE_FEATURES, self.categories.categories))
 
     def forward(
-        self, x_t: Tensor, t: Tensor, observed: Observed | None = None, text: Text | None = None
+        self, x_t: Tensor, t: Tensor | int, observed: Observed | None = None, text: Text | None = None
     ) -> tuple[Tensor, Tensor]:
         """The clean pose (B, N, 12), normalised, and the logits of the clean category (B, N, K)."""
         output, logits = self.output(x_t, t, observed, text)
-        moments = self.moments(state_of(x_t[..., POSE_FEATURES:]), t)
-        return self.poses.x0_from_output(x_t[..., :POSE_FEATURES], t, output, moments), logits
+        pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
+        if isinstance(t, Tensor) or self._mean is None or self._std is None or self.poses.prediction != "edm":
+            moments = self.moments(states, t) if isinstance(t, Tensor) else None
+            return self.poses.x0_from_output(pose, t, output, moments), logits
+        of_states = self._mean[t], self._std[t]
+        tables = self.poses.once(
+            t, pose, "states", lambda: (torch.stack(self.poses.output_scaling(t, pose, of_states), 1),)
+        )
+        return self.poses.x0_from_output(pose, t, output, None, tables[0][states].unbind(-2)), logits
 
 
 # -- packing: slots that are known to be empty are left out of a batch ----------------------------
 
 
-_CHUNKS = 4
+_CHUNKS = 3
 """Parts of a batch on the CPU, each as wide as its fullest scene."""
+_STRIDE = 4
+"""On other devices, widths are multiples of this: few layouts, which :class:`Replays` captures."""
 
 
 def pack(active: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
@@ -223,10 +417,12 @@ def pack(active: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         that is False on padding. Every scene is in one part. M is the largest number of active slots of a scene in the
         part, at least 1.
     """
-    counts = active.sum(dim=1)
-    chunks = _CHUNKS if active.device.type == "cpu" and len(active) >= 4 * _CHUNKS else 1
+    counts, on_cpu = active.sum(dim=1), active.device.type == "cpu"
+    chunks = _CHUNKS if on_cpu and len(active) >= 4 * _CHUNKS else 1
+    chunks = max(chunks, len(parts_of(len(active), max(1, int(counts.max())))))
     for rows in torch.argsort(counts, stable=True).tensor_split(chunks):
         width = max(1, int(counts[rows].max()))
+        width = width if on_cpu else min(active.shape[1], -(-width // _STRIDE) * _STRIDE)
         index = torch.argsort(~active[rows], dim=1, stable=True)[:, :width]
         yield rows, index, active[rows].gather(1, index)
 

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from agents.networks.denoisers import products_in
 from agents.networks.flux_modules import (
     CountConditioningConfig,
     CountEmbeddingConfig,
@@ -43,6 +44,28 @@ from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import POSE_FEATURES
 
 # -- blocks ---------------------------------------------------------------------------------------
+
+
+class _Gelu(torch.autograd.Function):
+    """GELU with tanh, written out: on a CPU this takes half of the time of the function of torch."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        if ctx is not None:
+            ctx.save_for_backward(x)
+        inner = torch.addcmul(x, x * x, x, value=0.044715).mul_(math.sqrt(2.0 / math.pi)).tanh_()
+        return torch.addcmul(x, x, inner).mul_(0.5)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        return torch.ops.aten.gelu_backward(gradients[0], *ctx.saved_tensors, approximate="tanh")  # type: ignore[no-any-return]
+
+
+def gelu(x: Tensor) -> Tensor:
+    """GELU in its form with tanh (Hendrycks and Gimpel 2016)."""
+    if x.device.type != "cpu" or torch.compiler.is_compiling():
+        return F.gelu(x, approximate="tanh")
+    return _Gelu.apply(x) if torch.is_grad_enabled() else _Gelu.forward(None, x)  # type: ignore[no-any-return, no-untyped-call]
 
 
 class SingleStreamBlock(nn.Module):
@@ -76,16 +99,24 @@ class SingleStreamBlock(nn.Module):
 
         Args:
             tokens: (B, T, H).
-            condition: (B, H).
+            condition: (B, H), after its nonlinearity, which all blocks share.
             mask: (B, 1 or heads, 1 or T, T), bool, True where to attend, or float, added to the attention logits.
             relations: (B, N, N, F) features of pairs of the last N tokens; needs a float mask.
         """
-        shift, scale, gate = self.modulation(F.silu(condition)).unsqueeze(1).chunk(3, dim=-1)
-        x = (1 + scale) * F.layer_norm(tokens, (self.hidden,), eps=1e-6) + shift
+        shift, scale, gate = self.modulation(condition).unsqueeze(1).chunk(3, dim=-1)
+        x = ((1 + scale) * F.layer_norm(tokens, (self.hidden,), eps=1e-6)).add_(shift)
         qkv, mlp = self.linear1(x).split([3 * self.hidden, self.mlp_hidden], dim=-1)
-        query, key, value = qkv.unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        attended = joint_attention(self.query_norm(query), self.key_norm(key), value, mask, relations, self.gathered)
-        return tokens + gate * self.linear2(torch.cat([attended, F.gelu(mlp, approximate="tanh")], dim=-1))
+        query, key, value = _heads(qkv, self.heads, self.query_norm, self.key_norm)
+        attended = joint_attention(query, key, value, mask, relations, self.gathered)
+        return torch.addcmul(tokens, gate, self.linear2(torch.cat([attended, gelu(mlp)], dim=-1)))
+
+
+def _heads(qkv: Tensor, heads: int, query_norm: nn.RMSNorm, key_norm: nn.RMSNorm) -> tuple[Tensor, ...]:
+    """Query, key and value (B, heads, T, W) of (B, T, 3 H), the first two normalised, both at once."""
+    parts = qkv.unflatten(-1, (3, heads, -1)).permute(2, 0, 3, 1, 4).contiguous()
+    scale = torch.stack([query_norm.weight, key_norm.weight]).view(2, 1, 1, 1, -1)
+    query, key = F.rms_norm(parts[:2], parts.shape[-1:], None, 1e-6).mul(scale)
+    return query, key, parts[2]
 
 
 class DoubleStreamBlock(nn.Module):
@@ -105,17 +136,21 @@ class DoubleStreamBlock(nn.Module):
     def forward(
         self, scene: Tensor, text: Tensor, condition: Tensor, mask: Tensor | None, relations: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Slots (B, N, H) and text (B, L, H) to the same; ``mask`` and ``relations`` as in single-stream blocks."""
+        """Slots (B, N, H) and text (B, L, H) to the same; the other arguments as in single-stream blocks.
+
+        A text that ends asks nothing: ``mask`` then has a row for each slot alone.
+        """
         scene, text = scene + self.scene.modality, text + self.text.modality
         rates = [stream.rates(condition) for stream in (self.text, self.scene)]
-        parts = [s.heads_of(x, r) for s, x, r in zip((self.text, self.scene), (text, scene), rates, strict=True)]
-        query, key, value = (torch.cat(pair, dim=2) for pair in zip(*parts, strict=True))
+        words: Any = self.text.heads_of(text, rates[0])
+        slots: Any = self.scene.heads_of(scene, rates[1])
+        query = slots[0] if words[0] is None else torch.cat([words[0], slots[0]], dim=2)
+        key, value = (torch.cat([words[part], slots[part]], dim=2) for part in (1, 2))
         attended = joint_attention(query, key, value, mask, relations, self.gathered)
-        count = text.shape[1]
-        return (
-            self.scene.finish(scene, attended[:, count:], rates[1]),
-            self.text.finish(text, attended[:, :count], rates[0]) if self.text.finishes else text,
-        )
+        if words[0] is None:
+            return self.scene.finish(scene, attended, rates[1]), text
+        of_words, of_slots = attended.split([text.shape[1], scene.shape[1]], dim=1)
+        return self.scene.finish(scene, of_slots, rates[1]), self.text.finish(text, of_words, rates[0])
 
 
 class _Stream(nn.Module):
@@ -138,19 +173,23 @@ class _Stream(nn.Module):
 
     def rates(self, condition: Tensor) -> tuple[Tensor, ...]:
         """Shift, scale and gate of the attention, then of the MLP, (B, 1, H) each; the first two where text ends."""
-        return self.modulation(F.silu(condition)).unsqueeze(1).chunk(6 if self.finishes else 2, dim=-1)  # type: ignore[no-any-return]
+        return self.modulation(condition).unsqueeze(1).chunk(6 if self.finishes else 2, dim=-1)  # type: ignore[no-any-return]
 
-    def heads_of(self, x: Tensor, rates: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
-        """Query, key and value (B, heads, N, width)."""
-        x = (1 + rates[1]) * F.layer_norm(x, (self.hidden,), eps=1e-6) + rates[0]
-        query, key, value = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        return self.query_norm(query), self.key_norm(key), value
+    def heads_of(self, x: Tensor, rates: tuple[Tensor, ...]) -> tuple[Tensor | None, Tensor, Tensor]:
+        """Query, key and value (B, heads, N, width); no query where text ends."""
+        x = ((1 + rates[1]) * F.layer_norm(x, (self.hidden,), eps=1e-6)).add_(rates[0])
+        if isinstance(self.query_norm, nn.RMSNorm):
+            query, key, value = _heads(self.qkv(x), self.heads, self.query_norm, self.key_norm)
+            return query, key, value
+        both = F.linear(x, self.qkv.weight[self.hidden :], self.qkv.bias[self.hidden :])
+        key, value = both.unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        return None, self.key_norm(key), value
 
     def finish(self, x: Tensor, attended: Tensor, rates: tuple[Tensor, ...]) -> Tensor:
         """The tokens after the gated residuals of attention and MLP."""
-        x = x + rates[2] * self.out(attended)
-        inner = (1 + rates[4]) * F.layer_norm(x, (self.hidden,), eps=1e-6) + rates[3]
-        return x + rates[5] * self.mlp(inner)
+        x = torch.addcmul(x, rates[2], self.out(attended))
+        inner = ((1 + rates[4]) * F.layer_norm(x, (self.hidden,), eps=1e-6)).add_(rates[3])
+        return torch.addcmul(x, rates[5], self.mlp[2](gelu(self.mlp[0](inner))))
 
 
 # -- continuous scenes ----------------------------------------------------------------------------
@@ -218,6 +257,7 @@ class FluxDenoiser(nn.Module):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         self.fourier = FourierFeatures(config.frequencies)
+        self.body_precision = "float32"
 
     def forward(self, x: Tensor, position: Tensor, noise_level: Tensor) -> Tensor:
         """Predict.
@@ -228,11 +268,13 @@ class FluxDenoiser(nn.Module):
             noise_level: (B,) noise-to-signal ratio of ``position``.
         """
         features = torch.cat([x, self.fourier(position, noise_level[:, None])], dim=-1)
-        condition = self.time_in(timestep_embedding(250.0 * noise_level.log(), 128))
+        condition = F.silu(self.time_in(timestep_embedding(250.0 * noise_level.log(), 128)))
         tokens = self.scene_in(features)
-        for block in self.blocks:
-            tokens = block(tokens, condition)
-        shift, scale = self.final_modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
+        with products_in(self.body_precision, tokens):
+            for block in self.blocks:
+                tokens = block(tokens, condition)
+        tokens = tokens.to(features.dtype)
+        shift, scale = self.final_modulation(condition).unsqueeze(1).chunk(2, dim=-1)
         return self.out((1 + scale) * F.layer_norm(tokens, (self.config.hidden,), eps=1e-6) + shift)
 
 
@@ -374,7 +416,8 @@ _TIME_WIDTH = 256
 class MixedFlux(nn.Module):
     """Poses (B, N, 12) and category states (B, N) to a pose output (B, N, 12) and logits (B, N, K).
 
-    Permutation-equivariant in the slots. Padding of the text is masked, so it changes nothing.
+    Permutation-equivariant in the slots. Padding of the text is masked, so it changes nothing. The products of the
+    blocks are in ``body_precision``, which denoisers set at every step of a chain.
 
     >>> network = MixedFlux(MixedFluxConfig(categories=8, hidden=32, heads=2, text_width=16))
     >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
@@ -413,6 +456,7 @@ class MixedFlux(nn.Module):
         )
         self.logits_out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, config.categories))
         self._build_modules("output")
+        self.body_precision = "float32"
         for layer in (self.final_modulation, self.pose_out[-1], self.logits_out[-1]):
             for parameter in layer.parameters():
                 nn.init.zeros_(parameter)
@@ -448,7 +492,7 @@ class MixedFlux(nn.Module):
         text, text_mask = self._take_text(scene, text, text_mask)
         self._read_geometry(scene, position, noise_level)
         embedded = timestep_embedding(time * self.config.time_scale, _TIME_WIDTH).to(pose.dtype)
-        condition = self._add(self.time_in(embedded), lambda module: module.condition(scene))
+        condition = F.silu(self._add(self.time_in(embedded), lambda module: module.condition(scene)))
         read = [module.pose_features(scene) for module in self._added()]
         features = self.pose_in(torch.cat([pose, *(part.to(pose) for part in read if part is not None)], dim=-1))
         slots = self._add(features + self.category_in(states), lambda module: module.slot_features(scene))
@@ -458,7 +502,7 @@ class MixedFlux(nn.Module):
         text = pose.new_zeros(len(pose), 1, self.config.text_width) if text is None else text
         words = None if self.text_in is None else self.text_in(text)
         tokens = self._attend(tokens, words, condition, text_mask, biases, scene)
-        shift, scale = self.final_modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)
+        shift, scale = self.final_modulation(condition).unsqueeze(1).chunk(2, dim=-1)
         features = self.final((1 + scale) * F.layer_norm(tokens, (self.config.hidden,), eps=1e-6) + shift)
         logits = self._add(self.logits_out(features), lambda module: module.logits(scene))
         return self._add(self.pose_out(features), lambda module: module.pose_output(scene, features)), logits
@@ -480,20 +524,30 @@ class MixedFlux(nn.Module):
 
     def _attend(
         self, slots: Tensor, words: Tensor | None, condition: Tensor, text_mask: Tensor | None,
-        biases: Iterator[Tensor | None], scene: Scene,
+        biases: Tensor | None, scene: Scene,
     ) -> Tensor:  # fmt: skip
-        """Slots (B, N, H) and words (B, L, H) through all blocks to slots (B, N, H)."""
-        count = 0 if words is None else words.shape[1]
-        mask = _where_to_attend(text_mask, scene.slot_mask, count, slots)
+        """Slots (B, N, H) and words (B, L, H) through all blocks to slots (B, N, H), in ``body_precision``."""
+        with products_in(self.body_precision, slots):
+            return self._blocks(slots, words, condition, text_mask, biases, scene).to(slots.dtype)
+
+    def _blocks(
+        self, slots: Tensor, words: Tensor | None, condition: Tensor, text_mask: Tensor | None,
+        biases: Tensor | None, scene: Scene,
+    ) -> Tensor:  # fmt: skip
+        if biases is not None and scene.slot_mask is not None:  # once for all blocks
+            biases = biases.masked_fill_(~scene.slot_mask[:, None, None], -torch.inf)
+        chosen: Iterator[Tensor | None] = itertools.repeat(None) if biases is None else iter(biases)
+        reaches = words is not None and self.config.text_reach == "all"
         if words is not None:
-            for block in self.double_blocks:
-                slots, words = block(slots, words, condition, _add_bias(next(biases), mask, count), scene.pairs)
-            if self.config.text_reach == "all":
-                slots = torch.cat([words, slots], dim=1)
-            else:
-                mask, count = None if mask is None else mask[..., count:], 0
+            for place, block in enumerate(self.double_blocks, 1):
+                asks = reaches or place < len(self.double_blocks)
+                mask = _mask(next(chosen), text_mask, scene.slot_mask, words.shape[1], slots, asks)
+                slots, words = block(slots, words, condition, mask, scene.pairs)
+        count = words.shape[1] if reaches and words is not None else 0
+        slots = torch.cat([words, slots], dim=1) if reaches and words is not None else slots
         for block in self.single_blocks:
-            slots = block(slots, condition, _add_bias(next(biases), mask, count), scene.pairs)
+            mask = _mask(next(chosen), text_mask if count else None, scene.slot_mask, count, slots[:, count:])
+            slots = block(slots, condition, mask, scene.pairs)
         return slots[:, count:]
 
     # -- modules ----------------------------------------------------------------------------------
@@ -546,14 +600,39 @@ class MixedFlux(nn.Module):
             scene.rotation = nearest_rotations(scene.noisy_rotation)
             scene.rotation_noise = noise_level * self.rotations[0].max().to(noise_level)
 
-    def _relate(self, scene: Scene) -> Iterator[Tensor | None]:
-        """Iterator over the biases (B, heads, N, N) of the blocks; puts features of pairs into ``scene``."""
+    def _relate(self, scene: Scene) -> Tensor | None:
+        """The biases (blocks, B, heads, N, N) of the blocks; puts features of pairs into ``scene``."""
         parts = [part for module in self._added() if (part := module.relations(scene)) is not None]
         if not parts:
-            return itertools.repeat(None)
+            return None
         biases, features = zip(*parts, strict=True)
         scene.pairs = features[0] if len(features) == 1 else torch.cat(features, dim=-1)
-        return iter(biases[0] if len(biases) == 1 else torch.stack(biases).sum(dim=0))
+        return biases[0] if len(biases) == 1 else torch.stack(biases).sum(dim=0)
+
+
+def _mask(
+    bias: Tensor | None, text_mask: Tensor | None, slot_mask: Tensor | None, count: int, slots: Tensor,
+    asks: bool = True,
+) -> Tensor | None:  # fmt: skip
+    """Mask of attention over ``count`` = L words, then N slots, for words and slots, or slots alone; None for none.
+
+    Args:
+        bias: (B, heads, N, N) of the slots, -inf on padding; None without relations.
+        text_mask: (B, L) bool.
+        slot_mask: (B, N) bool.
+        count: L.
+        slots: (B, N, H).
+        asks: whether words attend, too.
+    """
+    if bias is not None:
+        if count:
+            bias = F.pad(bias, (count, 0, count if asks else 0, 0))
+        if count and text_mask is not None:
+            bias[..., :count].masked_fill_(~text_mask[:, None, None], -torch.inf)
+        if count and asks and slot_mask is not None:
+            bias[..., :count, count:].masked_fill_(~slot_mask[:, None, None], -torch.inf)
+        return bias
+    return _where_to_attend(text_mask, slot_mask, count, slots)
 
 
 def _where_to_attend(text_mask: Tensor | None, slot_mask: Tensor | None, count: int, slots: Tensor) -> Tensor | None:
@@ -564,14 +643,6 @@ def _where_to_attend(text_mask: Tensor | None, slot_mask: Tensor | None, count: 
     words = everywhere[:, :count] if text_mask is None or not count else text_mask
     present = everywhere[:, count:] if slot_mask is None else slot_mask
     return torch.cat([words, present], dim=1)[:, None, None]
-
-
-def _add_bias(bias: Tensor | None, mask: Tensor | None, count: int) -> Tensor | None:
-    """Sum of attention biases: ``bias`` on the slots, which follow ``count`` tokens, and the mask."""
-    if bias is None:
-        return mask
-    bias = F.pad(bias, (count, 0, count, 0)) if count else bias
-    return bias if mask is None else bias.masked_fill(~mask, -torch.inf)
 
 
 # -- registration ---------------------------------------------------------------------------------
@@ -598,5 +669,5 @@ def _mixed_sizes(keys: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-register_network("flux", "continuous", FluxConfig, FluxDenoiser, ratio="mlp_ratio", sizes=_continuous_sizes)
-register_network("flux", "mixed", MixedFluxConfig, MixedFlux, ratio="mlp_ratio", sizes=_mixed_sizes)
+register_network("flux", "continuous", FluxConfig, FluxDenoiser, sizes=_continuous_sizes)
+register_network("flux", "mixed", MixedFluxConfig, MixedFlux, sizes=_mixed_sizes)

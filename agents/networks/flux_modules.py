@@ -16,6 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from agents.diffusion.categorical import one_hot
+
 Place = Literal["slots", "condition", "attention", "output"]
 """The part of the core after which the weights of a module are drawn, so that a seed keeps giving the same weights."""
 
@@ -225,7 +227,7 @@ def count_states(states: Tensor, categories: int, slot_mask: Tensor | None = Non
     >>> count_states(torch.tensor([[0, 0, 1, 2, 3, 3]]), 3).tolist()
     [[2.0, 1.0, 2.0]]
     """
-    counted = F.one_hot(states, categories + 1).float()
+    counted = one_hot(states, categories + 1, torch.float32)
     if slot_mask is not None:
         counted = counted * slot_mask[..., None]
     counts = counted.sum(dim=1)

@@ -29,14 +29,15 @@ from torch.nn import functional as F
 
 from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
 from scene_envs.errors import unknown_name
-from scene_envs.rotations import project_to_so3
+from scene_envs.normalizer import constant_on
+from scene_envs.rotations import quaternion_to_matrix
 
 # -- rotations ------------------------------------------------------------------------------------
 
 
 ROTATION_FEATURES = 9 + 4
 """Numbers per rotation."""
-_TILTS = (6, 7, 2, 5)
+_TILTS = torch.tensor([6, 7, 2, 5])
 """Entries R_20, R_21, R_02 and R_12 of a row-major matrix."""
 _MIN_ROTATION_NOISE = 1e-4
 _TILT_REACH = 4.0
@@ -85,15 +86,37 @@ class RotationFeatures(FluxModule):
         if turns is None:
             return None
         off, tilt = (turns * self.gates(features)).split([9, 4], dim=-1)
-        return F.pad(off.index_add(-1, torch.tensor(_TILTS, device=off.device), tilt), (3, 0))
+        return F.pad(off.index_add(-1, constant_on(_TILTS, off.device), tilt), (3, 0))
+
+
+_SQUARINGS = 12
+"""Squarings of the matrix of a quaternion, whose largest eigenvalue is then the only one that is left."""
 
 
 @torch.no_grad()
 def nearest_rotations(rotation: Tensor) -> Tensor:
-    """The rotations that are nearest to noisy matrices (B, N, 3, 3); the identity where all entries are NaN."""
+    """The rotations that are nearest to noisy matrices (B, N, 3, 3); the identity where all entries are NaN.
+
+    The quaternion is the eigenvector of the largest eigenvalue of a symmetric matrix (Davenport; Horn 1987, section 4).
+    Squaring the matrix again and again finds it with products alone, which a GPU can capture; an SVD is none.
+    """
     with torch.autocast(rotation.device.type, enabled=False):
-        wide = rotation if rotation.dtype == torch.float64 else rotation.float()
-        return project_to_so3(wide.nan_to_num())
+        wide = rotation.nan_to_num().double()
+        xx, xy, xz, yx, yy, yz, zx, zy, zz = wide.flatten(-2).unbind(-1)
+        entries = [
+            xx + yy + zz, zy - yz, xz - zx, yx - xy, zy - yz, xx - yy - zz, xy + yx, xz + zx,
+            xz - zx, xy + yx, yy - xx - zz, yz + zy, yx - xy, xz + zx, yz + zy, zz - xx - yy,
+        ]  # fmt: skip
+        square = torch.stack(entries, dim=-1).unflatten(-1, (4, 4)).flatten(0, -3)
+        square = square / (2.0 * torch.linalg.matrix_norm(wide).flatten()[:, None, None] + 1e-9)
+        square.diagonal(dim1=-2, dim2=-1).add_(0.9)  # positive
+        square[:, 0, 0] += 1e-14
+        for _ in range(_SQUARINGS):
+            square = square @ square
+            square = square / square.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[:, None, None]
+        best = square.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+        quaternion = square.gather(-1, best[:, None, None].expand(-1, 4, 1)).view(*wide.shape[:-2], 4)
+        return quaternion_to_matrix(quaternion).to(rotation if rotation.dtype == torch.float64 else torch.float32)
 
 
 @torch.no_grad()
@@ -116,7 +139,7 @@ def rotation_features(rotation: Tensor, nearest: Tensor, noise: Tensor) -> Tenso
     """
     level = noise.to(nearest).clamp(min=_MIN_ROTATION_NOISE)[..., None]
     off = (rotation.to(nearest) - nearest).flatten(-2) / level
-    tilt = nearest.flatten(-2)[..., list(_TILTS)]
+    tilt = nearest.flatten(-2).index_select(-1, constant_on(_TILTS, nearest.device))
     return torch.cat([off, tilt / (level.square() + (tilt / _TILT_REACH).square()).sqrt()], dim=-1)
 
 
@@ -170,15 +193,31 @@ def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
         noise: (B, N, 3) standard deviation of the noise on them along x, y, z, metres; (B, N, 1) if equal for all axes.
         scales: (8,) lengths, metres.
     """
-    variance, wide = noise.square(), scales.square()
-    x, y, z = (metres.unsqueeze(2) - metres.unsqueeze(1)).unsqueeze(-1).unbind(dim=-2)  # (B, N, N, 1)
-    blurs = (variance.unsqueeze(2) + variance.unsqueeze(1)).unsqueeze(-1).unbind(dim=-2)
-    along_x, along_y, along_z = [blur + wide for blur in blurs] if len(blurs) == 3 else [blurs[0] + wide] * 3  # ..., 8
+    place, variance = metres.movedim(-1, 0), noise.movedim(-1, 0).square()
+    wide = scales.square().view(-1, 1, 1, 1)
+    x, y, z = (place.unsqueeze(-1) - place.unsqueeze(-2)).split(1)  # (1, B, N, N)
+    blurs = (variance.unsqueeze(-1) + variance.unsqueeze(-2)).split(1)
+    along_x, along_y, along_z = [blur + wide for blur in blurs] if len(blurs) == 3 else [blurs[0] + wide] * 3  # (8, ...
     xx, yy, zz = x.square(), y.square(), z.square()
     reach_x = (xx + yy + along_x).sqrt()
     reach_y = reach_x if along_y is along_x else (xx + yy + along_y).sqrt()
-    parts = [torch.exp(-0.5 * (xx / along_x + yy / along_y)), torch.exp(-0.5 * zz / along_z)]
-    return torch.cat([*parts, z / (zz + along_z).sqrt(), x / reach_x, y / reach_y], dim=-1)
+    parts = [_gaussian(xx / along_x + yy / along_y), _gaussian(zz / along_z)]
+    return torch.cat([*parts, z / (zz + along_z).sqrt(), x / reach_x, y / reach_y]).movedim(0, -1)
+
+
+_LEAST = -60.0
+"""Least exponent of a feature."""
+
+
+def _gaussian(squares: Tensor) -> Tensor:
+    """exp(-x / 2), at least 1e-26: products of numbers below 1e-38 take a processor many times as long as others."""
+    return torch.exp((-0.5 * squares).clamp_(min=_LEAST))
+
+
+def linear_of_pairs(layer: nn.Linear, pairs: Tensor) -> Tensor:
+    """A linear layer on features of pairs (F, B, N, N), which are in front so that products read long rows."""
+    result = torch.addmm(layer.bias[:, None], layer.weight, pairs.flatten(1))
+    return result.unflatten(1, pairs.shape[1:])
 
 
 class Relations(FluxModule):
@@ -227,8 +266,10 @@ class Relations(FluxModule):
         unit = self.unit.to(position)
         blurred = unit if self.blur == "axis" else unit.max().reshape(1)
         features = pair_features(position * unit, noise_level.unsqueeze(-1) * blurred, self.scales.to(position))
-        bias: Tensor = self.out(F.silu(self.hidden(features[..., : 3 * _SCALES])))
-        return bias.unflatten(-1, (self.blocks, self.heads)).permute(3, 0, 4, 1, 2).contiguous(), features
+        seen = features.movedim(-1, 0)[: 3 * _SCALES]
+        inside = F.silu(linear_of_pairs(self.hidden, seen), inplace=not torch.is_grad_enabled())
+        bias = linear_of_pairs(self.out, inside)
+        return bias.unflatten(0, (self.blocks, self.heads)).transpose(1, 2), features
 
 
 def joint_attention(
@@ -244,12 +285,17 @@ def joint_attention(
     """
     if relations is None or gathered is None or mask is None:
         return F.scaled_dot_product_attention(query, key, value, attn_mask=mask).transpose(1, 2).flatten(-2)
-    weights = (query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5 + mask).softmax(dim=-1)
+    scores = torch.baddbmm(
+        mask.expand(*query.shape[:-1], -1).flatten(0, 1), query.flatten(0, 1), key.flatten(0, 1).mT,
+        alpha=query.shape[-1] ** -0.5,
+    )  # fmt: skip
+    weights = scores.softmax(dim=-1)
+    attended = (weights @ value.flatten(0, 1)).unflatten(0, query.shape[:2]).transpose(1, 2).flatten(-2)
     slots = relations.shape[1]
-    among = weights[:, :, -slots:, -slots:].transpose(1, 2)  # (B, N, heads, N)
+    among = weights.unflatten(0, query.shape[:2])[:, :, -slots:, -slots:].transpose(1, 2)  # (B, N, heads, N)
     message = gathered((among @ relations).flatten(-2))
-    attended = (weights @ value).transpose(1, 2).flatten(-2)
-    return attended + F.pad(message, (0, 0, attended.shape[1] - slots, 0))
+    others = attended.shape[1] - slots
+    return attended + (F.pad(message, (0, 0, others, 0)) if others else message)
 
 
 # -- contacts -------------------------------------------------------------------------------------
@@ -322,6 +368,8 @@ class Contacts(FluxModule):
         self.amplitudes = nn.Linear(width, CHANNELS * 2 * _GAPS)
         self.out = nn.Linear(width, hidden)
         self.gates = nn.Linear(embedding, 3 * CHANNELS)
+        self.gap_of: Tensor
+        self.register_buffer("gap_of", torch.tensor(_GAP_OF), persistent=False)
         for layer in (self.out, self.gates):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
@@ -354,53 +402,81 @@ class Contacts(FluxModule):
             features: (B, N, N, F) of pairs of slots.
             slot_mask: (B, N) bool, False for padding slots, which nothing may see; None where there are none.
         """
-        offset = metres.unsqueeze(2) - metres.unsqueeze(1)  # (B, N, N, 3) from j to i
-        variance = noise.square().unsqueeze(2) + noise.square().unsqueeze(1) + _MIN_NOISE**2
-        sideways = offset[..., :2].square().sum(dim=-1, keepdim=True).add(1e-12).sqrt()
-        toward = offset[..., :2] / sideways
-        own = offset @ rotation  # the axes of i
-        others = torch.einsum("bijw,bjwk->bijk", offset, rotation)
-        along = torch.cat([sideways, offset[..., 2:], own, others], dim=-1)  # (B, N, N, GAPS)
-        level = (toward.square() * variance[..., :2]).sum(dim=-1, keepdim=True)
-        squared = rotation.square()
-        spread = [level, variance[..., 2:], variance @ squared, torch.einsum("bijw,bjwk->bijk", variance, squared)]
-        both = torch.cat(spread, dim=-1).clamp(min=_MIN_NOISE**2).sqrt()  # (B, N, N, GAPS) noise along each
-        sign = along / (along.square() + both.square()).sqrt()
-        aside = toward * sign[..., :1]
+        place, spread = metres.movedim(-1, 0), noise.movedim(-1, 0).square()
+        offset = place.unsqueeze(-1) - place.unsqueeze(-2)  # (3, B, N, N) from j to i
+        variance = spread.unsqueeze(-1) + (spread + _MIN_NOISE**2).unsqueeze(-2)
+        turns = rotation.movedim((-2, -1), (0, 1))
+        mine, theirs = turns.unsqueeze(-1), turns.unsqueeze(-2)  # (3, 3, B, N, 1) of i, (3, 3, B, 1, N) of j
+        squared = offset[:2].square()
+        sideways = (squared[:1] + squared[1:] + 1e-12).sqrt()
+        toward = offset[:2] / sideways
+        along = torch.cat([sideways, offset[2:], _turned(offset, mine), _turned(offset, theirs)])  # (GAPS, B, N, N)
+        level = toward.square() * variance[:2]
+        level = level[:1] + level[1:]
+        squares = [_turned(variance, turn.square()) for turn in (mine, theirs)]
+        both = (
+            torch.cat([level, variance[2:], *squares]).clamp_(min=_MIN_NOISE**2).sqrt()
+        )  # (GAPS, ...) noise along each
+        sign = along / torch.hypot(along, both)
+        aside = toward * sign[:1]
         kinds = self.kind(states)
-        early, late = (self.own(kinds).unsqueeze(2) + self.other(kinds).unsqueeze(1)).chunk(2, dim=-1)
-        here = aside @ rotation[..., :2, :]  # the direction from j to i in the frame of i, and from i to j in that of j
-        there = -torch.einsum("bijw,bjwk->bijk", aside, rotation[..., :2, :])
-        pair = torch.cat([features, here, here.square(), there, there.square()], dim=-1)
-        seen = F.silu(self.seen(pair) + early)
-        gaps = (along.abs() - _TYPICAL * (1.0 + self.touch(seen))) / both
+        own, other = (layer(kinds).movedim(-1, 0) for layer in (self.own, self.other))  # (2 W, B, N)
+        own = own + torch.cat([self.seen.bias, self.weigh.bias])[:, None, None]
+        (early, late), (early_other, late_other) = own.unsqueeze(-1).chunk(2), other.unsqueeze(-2).chunk(2)
+        here = _turned(aside, mine[:2])  # the direction from j to i in the frame of i, and from i to j in that of j
+        there = _turned(-aside, theirs[:2])
+        shape, fresh = both.shape[1:], not torch.is_grad_enabled()
+        seen = _product(self.seen.weight, features.movedim(-1, 0), here, here.square(), there, there.square())
+        seen = F.silu(seen.unflatten(1, shape).add_(early).add_(early_other), fresh)
+        first, last = (layer for layer in self.touch if isinstance(layer, nn.Linear))
+        offered = F.silu(linear_of_pairs(first, seen), fresh).flatten(1)
+        level = along.abs() - _TYPICAL * (1.0 + last.bias[:, None, None, None])
+        gaps = level.flatten(1).addmm_(last.weight, offered, alpha=-_TYPICAL).unflatten(1, shape) / both
         bounded = gaps / (1.0 + (gaps / _GAP_REACH).square()).sqrt()
-        basis = [bounded, torch.sigmoid(-2.0 * gaps), torch.exp(-0.5 * gaps.square()), both[..., :1].log()]
-        weighed = F.silu(self.weigh(torch.cat([seen, *basis], dim=-1)) + late)
-        weighed = F.silu(self.second(weighed))
-        others_only = (~torch.eye(states.shape[1], dtype=torch.bool, device=states.device))[None].to(weighed)
-        present = (others_only if slot_mask is None else others_only * slot_mask.unsqueeze(1)).unsqueeze(-1)
-        weighed = torch.cat([weighed * present, present.expand(*weighed.shape[:-1], 1)], dim=-1)  # (B, N, N, W + 1)
+        steps = (-2.0 * gaps).clamp_(min=_LEAST).sigmoid()
+        weighed = _product(self.weigh.weight, seen, bounded, steps, _gaussian(gaps.square()), both[:1].log())
+        weighed = F.silu(weighed.unflatten(1, shape).add_(late).add_(late_other), fresh)
+        weighed = F.silu(linear_of_pairs(self.second, weighed), fresh)
         sign = sign / both
-        ways = [aside / both[..., :1], sign[..., 1:5], (sign[..., 5:, None] * rotation.mT.unsqueeze(1)).flatten(-2)]
-        moves = self._displacements(weighed, torch.cat(ways, dim=-1), bounded, rotation)
+        parts = [aside / both[:1], sign[1:5], sign[5:, None] * theirs.transpose(0, 1)]
+        parts += [part * gap for part, gap in zip(parts, (bounded[:1], bounded[1:5], bounded[5:, None]), strict=True)]
+        present = (1.0 - torch.eye(states.shape[1], dtype=both.dtype, device=both.device)).expand_as(both[0])
+        present = present if slot_mask is None else present * slot_mask.unsqueeze(1)
+        ways = torch.cat([*(part.reshape(-1, *shape) for part in parts), present.unsqueeze(0)]).mul_(present)
+        gathered = weighed.movedim(0, -2) @ ways.permute(1, 2, 3, 0)  # (B, N, W, 2 * 15 + 1), summed over other slots
+        moves = self._displacements(gathered[..., :-1], ways[:-1].sum(dim=-1).movedim(0, -1), rotation)
         moves = math.sqrt(2) * noise.unsqueeze(-2) * moves
-        known = (states < self.kind.num_embeddings - 1).unsqueeze(-1)
-        return self.out(weighed[..., :-1].sum(dim=2)) * known, moves
+        visible = (states < self.kind.num_embeddings - 1).unsqueeze(-1)
+        return self.out(gathered[..., -1]) * visible, moves
 
-    def _displacements(self, weighed: Tensor, ways: Tensor, bounded: Tensor, rotation: Tensor) -> Tensor:
+    def _displacements(self, gathered: Tensor, plain: Tensor, rotation: Tensor) -> Tensor:
         """Displacements (B, N, CHANNELS, 3): per gap one amplitude plus another times the gap, summed over other slots.
 
-        Amplitudes are linear in ``weighed`` (B, N, N, W + 1), so the sum over other slots is taken first. Then the cost
-        per pair does not grow with CHANNELS.
+        Amplitudes are linear in the weights of pairs, so the sum over other slots is taken first. Then the cost per
+        pair does not grow with CHANNELS. ``gathered`` (B, N, W, 2 * 15) are the ways of the gaps, then those times the
+        gaps, summed with the weights; ``plain`` (B, N, 2 * 15) are summed without.
         """
-        ways = torch.cat([ways, ways * bounded[..., _GAP_OF]], dim=-1)
-        gathered = weighed.mT @ ways  # (B, N, W + 1, 2 * 15)
+        gathered = torch.cat([gathered, plain.unsqueeze(-2)], dim=-2)
         amplitudes = torch.cat([self.amplitudes.weight, self.amplitudes.bias[:, None]], dim=1)
-        amplitudes = amplitudes.unflatten(0, (2, CHANNELS, _GAPS))[:, :, _GAP_OF]  # (2, CHANNELS, 15, W + 1)
+        amplitudes = amplitudes.unflatten(0, (2, CHANNELS, _GAPS)).index_select(2, self.gap_of)  # (2, C, 15, W + 1)
         moves = torch.einsum("biusq,scqu->bicq", gathered.unflatten(-1, (2, -1)), amplitudes)
         level, own, others = moves.split([3, 3, 9], dim=-1)
         return level + own @ rotation.mT + others.unflatten(-1, (3, 3)).sum(dim=-2)
+
+
+def _product(weight: Tensor, wide: Tensor, *others: Tensor) -> Tensor:
+    """(O, B * N * N) product of ``weight`` (O, F) with features of pairs; the first, ``wide``, is not copied."""
+    width = len(wide)
+    result = weight[:, :width] @ wide.flatten(1)
+    return result.addmm_(weight[:, width:], torch.cat(others).flatten(1))
+
+
+def _turned(vectors: Tensor, turns: Tensor) -> Tensor:
+    """Vectors (W, B, N, N) of the world along the three axes of frames (W, 3, B, N or 1, 1 or N): (3, B, N, N)."""
+    result = vectors[0] * turns[0]
+    for vector, turn in zip(vectors[1:], turns[1:], strict=True):
+        result = torch.addcmul(result, vector, turn)
+    return result
 
 
 def gated_displacement(displacements: Tensor, gates: Tensor) -> Tensor:

@@ -1,21 +1,17 @@
-"""Registry of networks: their sizes, how they are built, parameter counts, and how a size is written to a file."""
+"""Registry of networks: their sizes, how they are built, and how a size is written to a file."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
-from functools import lru_cache
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from typing import Any
 
-import torch
 from torch import nn
 
 from agents.configuration.composition import check_types
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.registry import load_plugins
 
-NETWORKS = ("flux", "midiffusion", "diffuscene")
-"""The Flux-style network, and the two that it is compared with."""
 NETWORK_PROCESSES = ("continuous", "mixed")
 """Processes that a network may denoise: scenes as numbers, or poses with discrete categories."""
 ENTRY_POINT_GROUP = "scene_envs.networks"
@@ -31,7 +27,6 @@ class _Entry:
 
     config: type[Any]
     network: Callable[[Any], nn.Module]
-    ratio: str | None
     sizes: Callable[[Mapping[str, Any]], dict[str, Any]]
 
 
@@ -39,7 +34,7 @@ _ENTRIES: dict[tuple[str, str], _Entry] = {}
 
 
 def register_network(
-    name: str, process: str, config: type[Any], network: Callable[[Any], nn.Module], *, ratio: str | None = None,
+    name: str, process: str, config: type[Any], network: Callable[[Any], nn.Module], *,
     sizes: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None,
 ) -> None:  # fmt: skip
     """Make a network known as ``network=NAME`` to training, files and comparisons.
@@ -56,7 +51,6 @@ def register_network(
         config: class of its configuration: a frozen dataclass of JSON values with ``categories`` (mixed) or
             ``features`` (continuous), and ``text_width`` where it reads text.
         network: function from such a configuration to a module, which keeps it as ``config``.
-        ratio: the field besides ``hidden`` that :func:`match_parameters` adjusts.
         sizes: function from the keys of :func:`network_config` to fields of ``config`` besides ``categories`` or
             ``features``; None takes the same keys.
 
@@ -72,7 +66,7 @@ def register_network(
         raise InvalidInputError(f"there is a {process} network {name!r} already; choose another name")
     known = {field.name for field in fields(config)}
     _ENTRIES[name, process] = _Entry(
-        config, network, ratio, sizes or (lambda keys: {key: value for key, value in keys.items() if key in known})
+        config, network, sizes or (lambda keys: {key: value for key, value in keys.items() if key in known})
     )
 
 
@@ -87,10 +81,7 @@ def list_networks(process: str) -> list[str]:
 
 
 def build_network(config: NetworkConfig) -> nn.Module:
-    """A network with fresh weights.
-
-    Raises:
-        InvalidInputError: ``config`` is not the configuration of a network.
+    """A network with fresh weights; an InvalidInputError if ``config`` is not the configuration of a network.
 
     >>> from agents.networks import MiDiffusionConfig
     >>> type(build_network(MiDiffusionConfig(features=20, hidden=32, depth=1))).__name__
@@ -107,7 +98,8 @@ def network_config(
     unit: tuple[float, float, float] = (1.0, 1.0, 1.0),
     rotations: tuple[tuple[float, ...], tuple[float, ...]] = ((1.0,) * 9, (0.0,) * 9),
 ) -> NetworkConfig:  # fmt: skip
-    """The size of a network from the keys that all networks share.
+    """The size of a network from the keys that all networks share; :class:`~agents.networks.MixedFluxConfig` describes
+    those that the mixed ``flux`` alone reads.
 
     Args:
         name: name of a network, see :func:`list_networks`.
@@ -118,16 +110,11 @@ def network_config(
         depth: number of blocks. Mixed ``flux`` with text has a third as many double-stream blocks in addition.
             ``diffuscene`` has a third as many residual blocks per level.
         heads: attention heads.
-        text_width: width of the text tokens; 0 for none. The continuous ``flux`` reads none.
-        frequencies: octaves of Fourier features, read by ``flux`` alone. The other networks have none, as
-            published, unless their configuration is made by hand.
-        double_blocks: number of double-stream blocks of the mixed ``flux``; None for a third of ``depth``.
-        embedding: width of the slots of the mixed ``flux``; None for ``hidden``.
-        pose_head, time_scale, text_reach, unit, rotations: read by the mixed ``flux`` alone, see
-            :class:`~agents.networks.MixedFluxConfig`.
-        modules: modules of the mixed ``flux``, as :class:`~agents.networks.MixedFluxConfig` takes them, without the
-            Fourier features, which ``frequencies`` adds. All are put in the order of
-            :data:`~agents.networks.flux.MODULES`. None for the flags of inpainting alone.
+        text_width: width of the text tokens, 0 for none; read by mixed networks.
+        frequencies: octaves of Fourier features, read by ``flux`` alone.
+        double_blocks: None for a third of ``depth``.
+        embedding: None for ``hidden``.
+        modules: in any order, without the Fourier features; None for the flags of inpainting alone.
 
     Raises:
         UnknownNameError: no network or no process has that name.
@@ -155,11 +142,8 @@ def config_state(config: NetworkConfig) -> dict[str, Any]:
 
 
 def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
-    """Inverse of :func:`config_state`.
-
-    Raises:
-        UnknownNameError: no network or no process has that name.
-        InvalidInputError: fields are missing or not known; the message names them.
+    """Inverse of :func:`config_state`. An UnknownNameError if no network or no process has that name, an
+    InvalidInputError that names fields which are missing, not known, or of another type.
     """
     name = state.get("kind", "")
     kind = _entry(name, process).config
@@ -194,82 +178,3 @@ def _entry_of(config: Any) -> _Entry:
         known = ", ".join(entry.config.__name__ for entry in _ENTRIES.values())
         raise InvalidInputError(f"{type(config).__name__} is not the configuration of a network; these are: {known}")
     return found[0]
-
-
-@lru_cache(maxsize=1024)
-def parameter_count(config: NetworkConfig) -> int:
-    """Number of parameters of a network; leaves the random state unchanged.
-
-    >>> from agents.networks import FluxConfig
-    >>> parameter_count(FluxConfig(features=20, hidden=96, depth=3, heads=4))
-    466916
-    """
-    with torch.random.fork_rng(devices=[]):
-        return sum(parameter.numel() for parameter in build_network(config).parameters())
-
-
-def match_parameters(name: str, process: str, target: int, **sizes: Any) -> NetworkConfig:
-    """The size at which a network has nearly ``target`` parameters, for comparisons at equal parameters.
-
-    The width ``hidden`` is chosen first, as a multiple of ``heads``. Then the width inside the blocks (the MLPs of the
-    transformers, the residual blocks of ``diffuscene``) is changed by at most 3/8. The least change that brings the
-    count within 1 % of ``target`` is taken, or else the change that brings it nearest.
-
-    Args:
-        name: name of a network.
-        process: ``"continuous"`` or ``"mixed"``.
-        target: parameters, as :func:`parameter_count` counts them.
-        sizes: the keys of :func:`network_config` except ``hidden``.
-
-    Raises:
-        InvalidInputError: the narrowest such network has more parameters than ``target``.
-
-    >>> ours = network_config("flux", "mixed", features=20, categories=8, hidden=96, depth=4, heads=4)
-    >>> keys = {"features": 20, "categories": 8, "depth": 4, "heads": 4}
-    >>> theirs = match_parameters("diffuscene", "mixed", parameter_count(ours), **keys)
-    >>> abs(parameter_count(theirs) / parameter_count(ours) - 1) < 0.03
-    True
-    """
-    ratio_field = _entry(name, process).ratio
-
-    def at_width(units: int) -> NetworkConfig:
-        return network_config(name, process, hidden=units * sizes["heads"], **sizes)
-
-    def at_ratio(config: NetworkConfig, step: int) -> NetworkConfig:
-        if ratio_field is None:
-            return config
-        return replace(config, **{ratio_field: getattr(config, ratio_field) * (1 + step / 64)})
-
-    smallest = parameter_count(at_width(1))
-    if target < smallest:
-        raise InvalidInputError(
-            f"target={target}: a {process} {name} network of this depth and these heads has at least {smallest} "
-            "parameters; ask for more, or lower depth"
-        )
-    highest = 1
-    while parameter_count(at_width(highest)) < target:
-        highest *= 2
-    width = _last(1, highest, lambda units: parameter_count(at_width(units)) <= target)
-    candidates: list[tuple[NetworkConfig, int]] = []
-    for units in (width, width + 1):
-        config = at_width(units)
-        step = _last(-24, 23, lambda step, config=config: parameter_count(at_ratio(config, step)) <= target)  # type: ignore[misc]
-        candidates += [(at_ratio(config, near), abs(near)) for near in (step, step + 1, 0)]
-
-    def distance(candidate: tuple[NetworkConfig, int]) -> tuple[float, int]:
-        """Sort key: relative error of the count, where errors below 1 % count as 1 %, then change of the ratio."""
-        config, departure = candidate
-        return max(abs(parameter_count(config) / target - 1.0), 0.01), departure
-
-    return min(candidates, key=distance)[0]
-
-
-def _last(low: int, high: int, holds: Callable[[int], bool]) -> int:
-    """The largest number from ``low`` to ``high`` for which ``holds`` is true; ``low`` when it is true for none.
-
-    Once ``holds`` is false for a number, it must be false for all larger ones.
-    """
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if holds(middle) else (low, middle - 1)
-    return low

@@ -70,10 +70,9 @@ class TextConfig:
         depth: transformer layers.
         heads: attention heads.
         max_tokens: longest prompt, its start token included.
-        latents: tokens that a prompt is condensed to, so that long ones cost no more than short ones; 0 for none.
+        latents: tokens that a prompt is condensed to, so that long ones cost no more than short ones.
         window: neighbouring words that are read together before attention ("two tea bottles"), an odd number.
-        count_tokens: leading tokens, one for each kind of object and one for all objects, for count conditioning; they
-            need latents.
+        count_tokens: leading tokens, one for each kind of object and one for all objects, for count conditioning.
         numbers: whether words that are numbers say how many they are (:func:`number_features`).
     """
 
@@ -88,8 +87,8 @@ class TextConfig:
     numbers: bool = False
 
     def __post_init__(self) -> None:
-        if self.count_tokens and not self.latents:
-            raise InvalidInputError("a text encoder without latents has no tokens for count conditioning; give latents")
+        if self.latents < 1:
+            raise InvalidInputError(f"a text encoder with latents={self.latents} gives no tokens; give at least 1")
         if self.window < 1 or self.window % 2 == 0:
             raise InvalidInputError(f"a text window of {self.window} words: give an odd number, 1 for single words")
 
@@ -105,10 +104,10 @@ class TextEncoder(nn.Module):
 
     The queries (``latents``) attend to the words, as in the Perceiver's first layer (Jaegle et al. 2021).
 
-    >>> encoder = TextEncoder(TextConfig(words=("cup", "two", "cups"), width=16, heads=2, latents=0))
+    >>> encoder = TextEncoder(TextConfig(words=("cup", "two", "cups"), width=16, heads=2, latents=4))
     >>> tokens, mask = encoder(["two cups", ""])
-    >>> tokens.shape, mask.tolist()
-    (torch.Size([2, 3, 16]), [[True, True, True], [True, False, False]])
+    >>> tokens.shape, bool(mask.all())
+    (torch.Size([2, 4, 16]), True)
     """
 
     def __init__(self, config: TextConfig) -> None:
@@ -130,10 +129,9 @@ class TextEncoder(nn.Module):
         )  # fmt: skip
         self.layers = nn.TransformerEncoder(layer, config.depth, enable_nested_tensor=False)
         self.norm = nn.LayerNorm(config.width)
-        questions = config.count_tokens + config.latents
-        self.questions = nn.Parameter(0.2 * torch.randn(questions, config.width)) if questions else None
-        self.condense = nn.MultiheadAttention(config.width, config.heads, batch_first=True) if config.latents else None
-        self.answer_norm = nn.LayerNorm(config.width) if config.latents else None
+        self.questions = nn.Parameter(0.2 * torch.randn(config.count_tokens + config.latents, config.width))
+        self.condense = nn.MultiheadAttention(config.width, config.heads, batch_first=True)
+        self.answer_norm = nn.LayerNorm(config.width)
 
     @property
     def token_space(self) -> tuple[int, int]:
@@ -179,7 +177,7 @@ class TextEncoder(nn.Module):
     def encode(self, indices: Tensor) -> tuple[Tensor, Tensor]:
         """Tokens and mask as of :meth:`forward`, from token indices (B, L) int64 as :meth:`tokenize` gives them."""
         indices = indices.to(self.position.device)
-        if self.condense is None or len(indices) < 4 * _CHUNKS or indices.device.type != "cpu":
+        if len(indices) < 4 * _CHUNKS or indices.device.type != "cpu":
             return self._encode(indices)
         lengths = (indices != PADDING).sum(dim=1)  # in parts of similar length: few prompts are as long as the longest
         order = torch.argsort(lengths, stable=True)
@@ -198,8 +196,6 @@ class TextEncoder(nn.Module):
             x = x + self.phrases(words).transpose(1, 2)
         x = x + self.position[: indices.shape[1]]
         x = self.norm(self.layers(x, src_key_padding_mask=~mask))
-        if self.condense is None or self.questions is None or self.answer_norm is None:
-            return x, mask
         queries = self.questions.expand(len(indices), -1, -1)
         answers, _ = self.condense(queries, x, x, key_padding_mask=~mask, need_weights=False)
         return self.answer_norm(answers + queries), mask.new_ones(answers.shape[:2])

@@ -12,7 +12,6 @@ import hashlib
 import logging
 import os
 import re
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -46,11 +45,8 @@ class Bert(NamedTuple):
 
 @lru_cache(maxsize=4)
 def load_bert(model: str, device: str = "cpu") -> Bert:
-    """The frozen model at ``model``, loaded once per process and device; only local files are read.
-
-    Args:
-        model: folder, or name on the hub of a model in the local cache.
-        device: torch device.
+    """The frozen model in the folder ``model``, or of that name on the hub and in the local cache, loaded once per
+    process and device; only local files are read.
 
     Raises:
         MissingDependencyError: ``transformers`` is not installed.
@@ -163,15 +159,8 @@ class BertTextConfig:
 
     @classmethod
     def from_model(cls, model: str | os.PathLike[str], *, download: bool = False) -> BertTextConfig:
-        """The config of a model at hand.
-
-        Args:
-            model: folder with the model, or its name on the hub, which is looked for in the local cache.
-            download: whether a hub model that is not in the cache is downloaded.
-
-        Raises:
-            MissingDependencyError: ``transformers`` is not installed.
-            InvalidInputError: no such model at hand, or not a BERT.
+        """The config of the model that :func:`load_bert` finds; ``download`` first fetches a hub model that is not in
+        the local cache. Errors as for :func:`load_bert`.
         """
         name = os.path.abspath(model) if Path(model).is_dir() else str(model)
         if download and not os.path.isdir(name):
@@ -210,7 +199,7 @@ class BertEncoder(nn.Module):
         super().__init__()
         self.config = config
         self.cached = cached
-        self._states: OrderedDict[Row, Tensor] = OrderedDict()
+        self._states: dict[Row, Tensor] = {}
         self.register_buffer("nothing", torch.full((len(config.nothing), config.width), torch.nan))
 
     @property
@@ -240,10 +229,8 @@ class BertEncoder(nn.Module):
         return nn.utils.rnn.pad_sequence([torch.tensor(row) for row in rows], batch_first=True), strange
 
     def forward(self, prompts: Sequence[str]) -> tuple[Tensor, Tensor]:
-        """Tokens (B, L, W) and their mask (B, L), True for real ones; ``""`` stands for no prompt.
-
-        Raises:
-            MissingDependencyError, InvalidInputError: as :meth:`tokenize`.
+        """Tokens (B, L, W) and their mask (B, L), True for real ones; ``""`` stands for no prompt. Errors as for
+        :meth:`tokenize`.
         """
         indices, unknown = self.tokenize(prompts)
         warn_unknown(unknown)
@@ -259,7 +246,7 @@ class BertEncoder(nn.Module):
 
     def _remembered(self, rows: list[Row]) -> dict[Row, Tensor]:
         """The hidden states (L, W) of each prompt; those that are not cached are computed, and cached."""
-        found = {row: self._states[row] for row in rows if row in self._states}
+        found = {row: self._states.pop(row) for row in rows if row in self._states}  # and become the latest again
         if self.config.nothing in rows:
             self._know_nothing()
             found[self.config.nothing] = self.nothing
@@ -268,11 +255,7 @@ class BertEncoder(nn.Module):
         for start in range(0, len(missing), together):
             some = missing[start : start + together]
             found.update(zip(some, self._hidden_states(some), strict=True))
-        for row in rows:
-            self._states[row] = found[row]
-            self._states.move_to_end(row)
-        while len(self._states) > self.cached:
-            self._states.popitem(last=False)
+        self._states = dict([*self._states.items(), *found.items()][-self.cached :])
         return found
 
     @torch.no_grad()
@@ -328,16 +311,8 @@ def text_encoder(config: AnyTextConfig) -> TextEncoder | BertEncoder:
 
 
 def text_config(key: str, prompts: Iterable[str]) -> AnyTextConfig:
-    """The configuration that a run's key ``text_encoder`` asks for.
-
-    Args:
-        key: ``"vocabulary"``, or the folder or hub name of a BERT model. A hub model that is not in the local cache is
-            downloaded.
-        prompts: all prompts of the training data, from which a closed vocabulary is made.
-
-    Raises:
-        MissingDependencyError: ``transformers`` is not installed.
-        InvalidInputError: no such BERT at hand.
+    """The configuration that a run's key ``text.encoder`` asks for: ``"vocabulary"``, a closed one of ``prompts``, or
+    the folder or hub name of a BERT model, with arguments and errors of :meth:`BertTextConfig.from_model`.
     """
     if key == VOCABULARY:
         return TextConfig(vocabulary(prompts))

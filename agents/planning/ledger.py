@@ -114,18 +114,10 @@ def best_different(pool: Sequence[Member], count: int) -> list[Member]:
 
 
 class SearchBudget:
-    """Budget of expansions of a planner, and a record of their results.
+    """Budget of expansions of a planner, and a record of their results; an InvalidInputError if it is below 1.
 
     :attr:`left` is 0 when the budget is spent, when a state of value 1 (the largest value) was found, or when the
-    problem stops the search.
-
-    Args:
-        problem: problem to search.
-        budget: largest number of expansions.
-        progress: function to call after every round.
-
-    Raises:
-        InvalidInputError: the budget is below 1.
+    problem stops the search. ``progress`` is called after every round.
     """
 
     def __init__(self, problem: Searchable, budget: int, progress: Progress | None = None) -> None:
@@ -234,12 +226,8 @@ class PlannerSettings:
 
     def make(self, branching: int) -> Any:
         """The planner: an object with ``plan(problem, budget, progress)``, as :class:`agents.planning.GreedyPlanner`.
-
-        Settings with a method ``plan`` are themselves the planner, with ``branching`` in place of null in the keys of
-        :data:`PER_STATE`.
-
-        Args:
-            branching: number of children of a state, which replaces null.
+        Settings with a method ``plan`` are themselves the planner, with ``branching``, the number of children of a
+        state, in place of null in the keys of :data:`PER_STATE`.
         """
         unset: dict[str, Any] = {name: branching for name in PER_STATE if getattr(self, name, branching) is None}
         return replace(self, **unset) if unset else self
@@ -254,12 +242,8 @@ Settings = TypeVar("Settings", bound=type[PlannerSettings])
 
 
 def register_planner(name: str) -> Callable[[Settings], Settings]:
-    """Make a planner available as ``planner=name``; decorates the dataclass of the planner's keys.
-
-    The method ``make`` of the dataclass makes the planner.
-
-    Raises:
-        InvalidInputError: the name is not one word.
+    """Make a planner available as ``planner=name``. It decorates the dataclass of the keys, whose method ``make`` makes
+    the planner. An InvalidInputError if the name is not one word.
     """
     _PLANNERS.check_name(name, "beam")
     return _PLANNERS.adding(name)

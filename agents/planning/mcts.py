@@ -70,7 +70,8 @@ class MCTSPlanner(PlannerSettings):
         while search.left and not root.closed:
             leaf = self._select(root)
             actions = search.actions(leaf.candidate)[: self.children or 1]
-            if not actions and _is_done(leaf.candidate.state):
+            mask = getattr(leaf.candidate.state, "mask", None)
+            if not actions and mask is not None and not bool(mask.any()):
                 break
             made = search.expand([(leaf.candidate, action) for action in actions])
             leaf.children = [_Node(child, leaf) for child in made if child.valid]
@@ -105,11 +106,6 @@ def _close(node: _Node) -> None:
     while current is not None and all(child.closed for child in current.children):
         current.closed = True
         current = current.parent
-
-
-def _is_done(state: object) -> bool:
-    mask = getattr(state, "mask", None)
-    return mask is not None and not bool(mask.any())
 
 
 def _cleaned(problem: Searchable, result: PlanResult) -> PlanResult:

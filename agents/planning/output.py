@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import heapq
 import itertools
 import json
@@ -18,10 +17,9 @@ import numpy as np
 import torch
 
 from agents.planning.ledger import PlanResult
-from agents.planning.settings import SearchConfig
 from scene_envs.envs import SearchState
 from scene_envs.errors import CorruptFileError
-from scene_envs.files import finite, page_part, page_template, write_json, write_text
+from scene_envs.files import finite, page_part, page_template, with_digest, without_digest, write_json, write_text
 from scene_envs.scene import SceneBatch
 
 MAX_PATH_SCENES = 60
@@ -86,13 +84,8 @@ class SearchRecord:
         best: Mapping[int, tuple[int, ...]],
         settings: Mapping[str, Any],
     ) -> SearchRecord:
-        """The record of searches that started from ``roots``.
-
-        Args:
-            roots: a state per search, each with a seed of its own.
-            states: all expanded states, in order.
-            best: path of the best state, by seed; the best search first.
-            settings: settings of the search; must contain ``nfe_per_scene``.
+        """The record of searches that started from ``roots``, which have a seed each. ``states`` are all expanded ones,
+        in order; ``best`` has the path of the best state by seed, the best search first.
         """
         rows: list[dict[str, Any]] = []
         ids: dict[tuple[int, tuple[int, ...]], int] = {}
@@ -140,8 +133,8 @@ class SearchRecord:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the record atomically, as JSON with a digest of its content."""
-        content = finite({**vars(self), "nodes": [asdict(node) for node in self.nodes]})
-        write_json(path, {"format": _FORMAT, "sha256": _digest(content), **content}, indent=None)
+        content = {"format": _FORMAT, **vars(self), "nodes": [asdict(node) for node in self.nodes]}
+        write_json(path, with_digest(content), indent=None)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SearchRecord:
@@ -154,23 +147,16 @@ class SearchRecord:
         text = Path(path).read_bytes()
         try:
             content = json.loads(text)
-            kind, digest = content.pop("format"), content.pop("sha256")
+            kind = content["format"]
         except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
             raise CorruptFileError(
                 f"{str(path)!r} is truncated or no search tree; run the search again with the same output to write it"
             ) from error
         if kind != _FORMAT:
             raise CorruptFileError(f"{str(path)!r} is {kind!r}, and {_FORMAT!r} is needed")
-        if digest != _digest(content):
-            raise CorruptFileError(
-                f"{str(path)!r} was changed after it was written; run the search again with the same output to write it"
-            )
+        content = without_digest(content, path)
         nodes = [TreeNode(**{**node, "mask": tuple(node["mask"])}) for node in content["nodes"]]
         return cls(content["settings"], content["searches"], nodes)
-
-
-def _digest(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=True).encode()).hexdigest()
 
 
 def loss_of(plan: PlanResult) -> float:
@@ -178,52 +164,15 @@ def loss_of(plan: PlanResult) -> float:
     return -plan.best_value if math.isfinite(plan.best_value) else math.inf
 
 
-def search_metrics(
-    objective: Any,
-    scale: float,
-    config: SearchConfig,
-    searches: Sequence[PlanResult],
-    best_of: PlanResult | None,
-    firsts: dict[int, SearchState],
-    seconds: dict[str, float],
-    stopped: str,
-    spent: int,
-    from_scenes: bool,
-) -> dict[str, Any]:
-    """The figures of a run that generated ``spent`` scenes; ``stopped`` says why it ended early, and may be empty.
-    ``firsts`` has the best of the first samples of each search, or its start scene, by the seed of the search.
-    """
-    search = min(searches, key=loss_of)
-    first = firsts[search.best_state.seed]
-    metrics = {
-        "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", repr(objective)),
-        "objective_scale": scale,
-        "saturated": search.best_state.objective > scale,
-        "below_zero": search.best_state.objective < 0,
-        "planner": config.planner.name,
-        "stopped": stopped or None,
-        "nfe": spent * config.nfe_per_scene,
-        "start" if from_scenes else "first_samples": _of_state(first),
-        "search": _of_plan(search),
-        "seconds": {name: round(value, 2) for name, value in seconds.items()},
-    }
-    if len(searches) > 1:
-        metrics["searches"] = [
-            _of_plan(plan) | ({"start": _of_state(firsts[plan.best_state.seed])} if from_scenes else {})
-            for plan in searches
-        ]
-    if best_of is not None:
-        metrics["best_of"] = _of_plan(best_of)
-    return metrics
-
-
-def _of_state(state: SearchState) -> dict[str, float | None]:
+def figures_of(state: SearchState) -> dict[str, float | None]:
+    """Φ and the raw objective of a state; None if it could not be scored."""
     return {"value": state.value, "objective": state.objective} if state.valid else {"value": None, "objective": None}
 
 
-def _of_plan(plan: PlanResult) -> dict[str, Any]:
+def plan_figures(plan: PlanResult) -> dict[str, Any]:
+    """The figures of a plan for ``metrics.json``."""
     return {
-        **_of_state(plan.best_state),
+        **figures_of(plan.best_state),
         "path": list(plan.best_path),
         "expansions": len(plan.values),
         "invalid": sum(map(math.isnan, plan.values)),

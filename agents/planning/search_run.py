@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,9 @@ from agents.planning.output import (
     SearchRecord,
     draw_curve,
     draw_scene,
+    figures_of,
     loss_of,
-    search_metrics,
+    plan_figures,
     shown_nodes,
     write_tree_page,
 )
@@ -37,6 +39,12 @@ _PLAIN = (bool, int, float, str, list, dict, type(None))
 
 _LIMITS = ("budget", "max_nfe", "max_seconds", "baseline", "workers")
 """Keys that do not affect the states of a search: they may change when a run is resumed."""
+
+_OF_ENV = (
+    "max_depth", "num_steps", "objective_scale", "workers", "physics", "prompt", "guidance", "claim_guidance",
+    "physics_guidance",
+)  # fmt: skip
+"""Settings of a search that are arguments of its environment."""
 
 Progress = Callable[[str, int, int, float], None]
 """Called after every round with the planner's name, the expansions so far, the budget and the best Φ so far."""
@@ -110,109 +118,146 @@ def run_search(
         scenes = scenes.to("cpu")[: config.count]
     config = replace(config, count=(config.count or 1) if scenes is None else len(scenes))
     named = {"prior": prior, "objective": objective, **plain_tree(config)}
-    if output is None:
-        return _search(prior, objective, scenes, named, config, None, progress)
-    with claimed(output, "run_search") as folder:
-        return _search(prior, objective, scenes, named, config, folder, progress)
+    with nullcontext() if output is None else claimed(output, "run_search") as folder:
+        return _Run(prior, objective, config, named, scenes, folder, progress).search()
 
 
-def _search(
-    prior: Any,
-    objective: Any,
-    starts: SceneBatch | None,
-    named: dict[str, Any],
-    config: SearchConfig,
-    folder: Path | None,
-    progress: Progress | None,
-) -> SearchOutcome:
-    """:func:`run_search` with its settings resolved, in a folder that no other process writes into."""
-    loaded = resolve_prior(prior)
-    fixed = {key: value for key, value in named.items() if key not in _LIMITS} | {"prior": loaded}
-    if starts is not None:
-        if starts.scene_type.name != loaded.scene_type.name:
-            raise InvalidInputError(
-                f"the prior makes scenes of {loaded.scene_type.name!r}, and the search would start from scenes of "
-                f"{starts.scene_type.name!r}; give a prior of that type"
-            )
-        fixed["scenes"], least = starts, max(loaded.scene_type.slots, starts.tensor.shape[1])
-        starts = starts.with_slots(least if config.slots is None else config.slots)
-    run = _Run(loaded, objective, config, fixed, folder, starts)
-    started = time.perf_counter()
-    planner, scenes = config.planner.make(config.branching), config.expansions
-    actions = max(scenes, config.branching) if config.planner.widens else config.branching
-    searches: list[PlanResult] = []
-    firsts: dict[int, SearchState] = {}
-    spent, stopped, parts = 0, "", config.parts
-    for part in parts:
-        left = math.inf if config.max_seconds is None else config.max_seconds - (time.perf_counter() - started)
-        if left <= 0 and spent:
-            stopped = "time"
-            break
-        name = "search" if len(parts) == 1 else f"search_{part.start:06}"
-        env, session, plans = run.plan(planner, actions, scenes, part, name, progress, max(left, 1e-9))
-        spent, stopped = spent + sum(len(plan.values) for plan in plans), session.stopped
-        found = plans if starts is not None else [plan for plan in plans if plan.best_path]
-        searches += found
-        if starts is None:
-            searches.sort(key=loss_of)
-        for lane in session.lanes:
-            if starts is not None or lane.first:
-                new = lane.first[: config.branching] if starts is None else [lane.root]
-                firsts[lane.root.seed] = max(new, key=lambda state: state.value if state.valid else -1.0)
-        if folder is not None and len(parts) > 1 and searches:
-            _scenes(env, searches).save(folder / "best.safetensors")
-        if stopped:
-            break
-    searched, best_of = time.perf_counter(), None
-    if config.baseline and spent and stopped in ("", "time"):
-        # Children are seeded by their path: the first scenes are those of the first search, unless that is steered.
-        wide = spent if config.masks is None else max(actions, -(-spent // len(config.masks)))
-        _, _, (best_of,) = run.plan(BestOfPlanner(), wide, spent, range(1), "best of N", progress)
-    seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}
-    root = session.lanes[0].root
-    if not searches and root.value >= 1:
-        raise InvalidInputError(
-            f"the objective {objective!r} is {root.objective:.4g} for the empty scene already, and the search ends at "
-            f"objective_scale={env.problem.scale:.4g}; give a larger objective_scale"
-        )
-    if not any(math.isfinite(plan.best_value) for plan in searches):
-        which = f"the first {config.branching} samples of the prior" if starts is None else "the scenes of the search"
-        raise SceneEnvsError(
-            f"the search was interrupted before its first {config.branching} scenes were made; call it again"
-            if stopped and not spent
-            else f"the objective {objective!r} could not score any of {which}; the log above says why"
-        )
-    best = min(searches, key=loss_of)
-    first = firsts[best.best_state.seed]
-    outcome = SearchOutcome(
-        search=best,
-        searches=searches,
-        best_of=best_of,
-        first=env.scene(first),
-        best=_scenes(env, searches),
-        metrics=search_metrics(
-            objective, env.problem.scale, config, searches, best_of, firsts, seconds, stopped, spent, starts is not None
-        ),
-    )
-    if folder is not None:
-        _write(outcome, config, env.scene(best.best_state), first, folder)
-        if len(parts) == 1:
-            _write_tree(outcome, env, session, folder)
-        plain = {key: value for key, value in named.items() if isinstance(value, _PLAIN)}
-        write_text(folder / "config.yaml", sealed(config_text(plain)))
-    return outcome
-
-
-@dataclass(frozen=True)
+@dataclass
 class _Run:
-    """Settings that all searches of one run share."""
+    """A search run, in a folder that no other process writes into; see :func:`run_search`."""
 
     prior: Any
     objective: Any
     config: SearchConfig
-    named: dict[str, Any]
+    named: dict[str, Any]  # settings, by the names of the arguments of run_search
+    starts: SceneBatch | None
     folder: Path | None
-    starts: SceneBatch | None = None
+    progress: Progress | None
+    searches: list[PlanResult] = field(default_factory=list)  # so far, as in the outcome
+    firsts: dict[int, SearchState] = field(default_factory=dict)  # by seed of a search: best first sample, or the start
+    spent: int = 0  # scenes generated
+    stopped: str = ""  # why the run ended early
+
+    def __post_init__(self) -> None:
+        self.prior, starts = resolve_prior(self.prior, self.config.device), self.starts
+        if self.config.precision != "float32":
+            self.prior = self.prior.with_precision(self.config.precision)
+        self.fixed = {key: value for key, value in self.named.items() if key not in _LIMITS} | {"prior": self.prior}
+        if starts is None:
+            return
+        scene_type = self.prior.scene_type
+        if starts.scene_type.name != scene_type.name:
+            raise InvalidInputError(
+                f"the prior makes scenes of {scene_type.name!r}, and the search would start from scenes of "
+                f"{starts.scene_type.name!r}; give a prior of that type"
+            )
+        self.fixed["scenes"], least = starts, max(scene_type.slots, starts.tensor.shape[1])
+        self.starts = starts.with_slots(least if self.config.slots is None else self.config.slots)
+
+    def search(self) -> SearchOutcome:
+        """The outcome, which is also written to the folder."""
+        config, starts, started = self.config, self.starts, time.perf_counter()
+        planner, scenes = config.planner.make(config.branching), config.expansions
+        actions = max(scenes, config.branching) if config.planner.widens else config.branching
+        for part in config.parts:
+            left = math.inf if config.max_seconds is None else config.max_seconds - (time.perf_counter() - started)
+            if left <= 0 and self.spent:
+                self.stopped = "time"
+                break
+            name = "search" if len(config.parts) == 1 else f"search_{part.start:06}"
+            env, session, plans = self.plan(planner, actions, scenes, part, name, max(left, 1e-9))
+            self.spent, self.stopped = self.spent + sum(len(plan.values) for plan in plans), session.stopped
+            self.searches += plans if starts is not None else [plan for plan in plans if plan.best_path]
+            if starts is None:
+                self.searches.sort(key=loss_of)
+            for lane in session.lanes:
+                if starts is not None or lane.first:
+                    new = lane.first[: config.branching] if starts is None else [lane.root]
+                    self.firsts[lane.root.seed] = max(new, key=lambda state: state.value if state.valid else -1.0)
+            if self.folder is not None and len(config.parts) > 1 and self.searches:
+                _scenes(env, self.searches).save(self.folder / "best.safetensors")
+            if self.stopped:
+                break
+        searched, best_of = time.perf_counter(), None
+        if config.baseline and self.spent and self.stopped in ("", "time"):
+            # Children are seeded by their path: the first scenes are those of the first search, unless that is steered.
+            wide = self.spent if config.masks is None else max(actions, -(-self.spent // len(config.masks)))
+            _, _, (best_of,) = self.plan(BestOfPlanner(), wide, self.spent, range(1), "best of N")
+        seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}
+        self._check_found(session.lanes[0].root, env.problem.scale)
+        best = min(self.searches, key=loss_of)
+        outcome = SearchOutcome(
+            search=best,
+            searches=self.searches,
+            best_of=best_of,
+            first=env.scene(self.firsts[best.best_state.seed]),
+            best=_scenes(env, self.searches),
+            metrics=self._metrics(best_of, env.problem.scale, seconds),
+        )
+        if self.folder is not None:
+            self._write(outcome, env, self.folder)
+            if len(config.parts) == 1:
+                _write_tree(outcome, env, session, self.folder)
+        return outcome
+
+    def _check_found(self, root: SearchState, scale: float) -> None:
+        """Refuse a search whose empty ``root`` has the largest value, and one in which no scene could be scored."""
+        if not self.searches and root.value >= 1:
+            raise InvalidInputError(
+                f"the objective {self.objective!r} is {root.objective:.4g} for the empty scene already, and the search "
+                f"ends at objective_scale={scale:.4g}; give a larger objective_scale"
+            )
+        if not any(math.isfinite(plan.best_value) for plan in self.searches):
+            samples = f"first {self.config.branching} samples of the prior"
+            which = samples if self.starts is None else "scenes of the search"
+            raise SceneEnvsError(
+                f"the search was interrupted before its first {self.config.branching} scenes were made; call it again"
+                if self.stopped and not self.spent
+                else f"the objective {self.objective!r} could not score any of the {which}; the log above says why"
+            )
+
+    def _metrics(self, best_of: PlanResult | None, scale: float, seconds: dict[str, float]) -> dict[str, Any]:
+        """Contents of ``metrics.json``."""
+        named, starts, best = self.objective, self.starts, min(self.searches, key=loss_of)
+        metrics: dict[str, Any] = {
+            "objective": named if isinstance(named, str) else getattr(named, "__name__", repr(named)),
+            "objective_scale": scale,
+            "saturated": best.best_state.objective > scale,
+            "below_zero": best.best_state.objective < 0,
+            "planner": self.config.planner.name,
+            "stopped": self.stopped or None,
+            "nfe": self.spent * self.config.nfe_per_scene,
+            "first_samples" if starts is None else "start": figures_of(self.firsts[best.best_state.seed]),
+            "search": plan_figures(best),
+            "seconds": {name: round(value, 2) for name, value in seconds.items()},
+        }
+        if len(self.searches) > 1:
+            metrics["searches"] = [
+                plan_figures(plan)
+                | ({} if starts is None else {"start": figures_of(self.firsts[plan.best_state.seed])})
+                for plan in self.searches
+            ]
+        return metrics if best_of is None else {**metrics, "best_of": plan_figures(best_of)}
+
+    def _write(self, outcome: SearchOutcome, env: SearchEnv, folder: Path) -> None:
+        config, metrics, best = self.config, outcome.metrics, outcome.search
+        write_json(folder / "metrics.json", metrics, indent=2)
+        outcome.best.save(folder / "best.safetensors")
+        draw_curve(
+            {
+                config.planner.name: best.curve,
+                **({} if outcome.best_of is None else {"best of N": outcome.best_of.curve}),
+            },
+            folder / "curve.png",
+            num_steps=config.nfe_per_scene,
+            first=config.branching if self.starts is None else 0,
+            scale=metrics["objective_scale"],
+            label=str(metrics["objective"]).replace("_", " "),
+        )
+        draw_scene(outcome.first, self.firsts[best.best_state.seed], folder / "before.png")
+        draw_scene(env.scene(best.best_state), best.best_state, folder / "after.png")
+        plain = {key: value for key, value in self.named.items() if isinstance(value, _PLAIN)}
+        write_text(folder / "config.yaml", sealed(config_text(plain)))
 
     def plan(
         self,
@@ -221,7 +266,6 @@ class _Run:
         budget: int,
         part: range,
         name: str,
-        progress: Progress | None,
         max_seconds: float = math.inf,
     ) -> tuple[SearchEnv, Session, list[PlanResult]]:
         """The environment with ``actions`` actions per state, the session, and a plan of ``budget`` scenes per search
@@ -236,26 +280,19 @@ class _Run:
             scene=self.prior.scene_type,
             objective=self.objective,
             branching=actions,
-            max_depth=config.max_depth,
-            num_steps=config.num_steps,
             prior=self.prior,
             slots=config.slots if self.starts is None else self.starts.tensor.shape[1],
             **masks,
-            objective_scale=config.objective_scale,
-            workers=config.workers,
-            physics=config.physics,
-            prompt=config.prompt,
-            guidance=config.guidance,
-            claim_guidance=config.claim_guidance,
-            physics_guidance=config.physics_guidance,
+            **{key: getattr(config, key) for key in _OF_ENV},
         )
         journal = None
         if self.folder is not None:
-            journal = Journal(self.folder / f"{name.replace(' ', '_')}.journal", self.named)
+            journal = Journal(self.folder / f"{name.replace(' ', '_')}.journal", self.fixed)
         session = Session(env, max_seconds=max_seconds, journal=journal)
         title, total = name.split("_")[0], budget * (config.count or 1 if name.startswith("search") else 1)
         before = part.start * budget
-        report = None if progress is None else lambda done, best: progress(title, before + done, total, best)
+        report_to = self.progress
+        report = None if report_to is None else lambda done, best: report_to(title, before + done, total, best)
         try:
             empty = SceneBatch.empty(self.prior.scene_type, 1, env.problem.slots)
             roots = []
@@ -271,24 +308,6 @@ class _Run:
 
 def _scenes(env: SearchEnv, plans: Sequence[PlanResult]) -> SceneBatch:
     return SceneBatch.concatenate([env.scene(plan.best_state) for plan in plans])
-
-
-def _write(outcome: SearchOutcome, config: SearchConfig, best: SceneBatch, first: SearchState, output: Path) -> None:
-    write_json(output / "metrics.json", outcome.metrics, indent=2)
-    outcome.best.save(output / "best.safetensors")
-    curves = {config.planner.name: outcome.search.curve}
-    if outcome.best_of is not None:
-        curves["best of N"] = outcome.best_of.curve
-    draw_curve(
-        curves,
-        output / "curve.png",
-        num_steps=config.nfe_per_scene,
-        first=0 if "start" in outcome.metrics else config.branching,
-        scale=outcome.metrics["objective_scale"],
-        label=str(outcome.metrics["objective"]).replace("_", " "),
-    )
-    draw_scene(outcome.first, first, output / "before.png")
-    draw_scene(best, outcome.search.best_state, output / "after.png")
 
 
 def _write_tree(outcome: SearchOutcome, env: SearchEnv, session: Session, output: Path) -> None:

@@ -34,15 +34,9 @@ _HEAD = struct.Struct("<II")
 class Journal:
     """A file of records: the settings of the search, then the states of every round, in order.
 
-    A record that was being written when the process was killed is dropped.
-
-    Args:
-        path: journal file, created if it does not exist.
-        settings: settings on which the states depend, by name.
-
-    Raises:
-        InvalidInputError: the file was made with other settings.
-        CorruptFileError: the file is no journal, or is damaged before its end.
+    The file at ``path`` is created if it does not exist; the states depend on ``settings``, which are named. A record
+    that was being written when the process was killed is dropped. An InvalidInputError if the file was made with other
+    settings; a CorruptFileError if it is no journal, or is damaged before its end.
     """
 
     def __init__(self, path: str | os.PathLike[str], settings: Mapping[str, Any]) -> None:
@@ -189,14 +183,6 @@ class Lane:
         """The root of the plan."""
         return self.root
 
-    def legal_actions(self, state: Any) -> Sequence[int]:
-        """Actions that can be expanded from ``state``."""
-        return self.problem.legal_actions(state)
-
-    def evaluate(self, state: Any) -> float:
-        """The objective of ``state``, in [0, 1]."""
-        return self.problem.evaluate(state)
-
     def expand_batch(self, pairs: Pairs, steering: Any = None) -> list[Any]:
         """The child of every pair; raises SearchStoppedError when the budget is spent or the session ends."""
         if len(self.values) + len(pairs) > self.budget:
@@ -258,14 +244,9 @@ class Session:
         *,
         root_counts: bool = False,
     ) -> list[PlanResult]:
-        """One plan of ``budget`` expansions per root.
-
-        Args:
-            planner: object with a method ``plan(problem, budget, progress)``.
-            roots: states that the plans start from.
-            budget: expansions of each plan.
-            progress: called with the expansions of all plans together, and with the lowest of the plans' best values.
-            root_counts: whether a root may be the best state of its plan.
+        """One plan of ``budget`` expansions per root, by the method ``plan(problem, budget, progress)`` of ``planner``.
+        ``progress`` is called with the expansions of all plans together and the lowest of their best values;
+        ``root_counts`` says whether a root may be the best state of its plan.
         """
         lanes = self.lanes = [Lane(self.problem, root, budget, self._expand, root_counts) for root in roots]
 

@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from agents.configuration.composition import SamplingKeys, composed, named, nested, require_at_least
+from agents.configuration.composition import (
+    DeviceKeys,
+    PrecisionKeys,
+    SamplingKeys,
+    composed,
+    named,
+    nested,
+    require_at_least,
+)
 from agents.planning.gradient import GradientPlanner
 from agents.planning.ledger import PlannerSettings, list_planners, planner_settings
 from scene_envs.errors import InvalidInputError
@@ -25,10 +33,11 @@ class BudgetKeys:
 
 @composed
 @dataclass
-class SearchConfig(BudgetKeys, SamplingKeys):
+class SearchConfig(BudgetKeys, SamplingKeys, PrecisionKeys, DeviceKeys):
     """Settings of a search.
 
-    Keys that are not listed are those of :class:`~agents.configuration.composition.SamplingKeys`.
+    Keys that are not listed are those of :class:`~agents.configuration.composition.SamplingKeys` and
+    :class:`~agents.configuration.composition.DeviceKeys`.
 
     Attributes:
         budget: number of scenes that each search generates; the baseline generates as many. NFE is ``budget *

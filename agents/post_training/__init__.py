@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from agents.post_training.guard import Guard
     from agents.post_training.policy import DenoisingPolicy, gradient_weights
     from agents.post_training.report import post_train_and_compare
-    from agents.post_training.rollouts import SeededPolicy, collect
+    from agents.post_training.rollouts import collect
     from agents.post_training.settings import (
         AlgorithmSettings,
         DDPOSFSettings,
@@ -42,7 +42,6 @@ __all__ = [
     "PostTrainConfig",
     "PostTrainResult",
     "PostTrainer",
-    "SeededPolicy",
     "collect",
     "compute_advantages",
     "gradient_weights",

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from agents.post_training.report import (
     PHYSICS_TIMEOUT,
@@ -30,8 +27,10 @@ from agents.post_training.report import (
 from agents.post_training.run_files import METRICS_NAME, write_metrics
 from agents.priors.prior import ScenePrior
 from rewards import reward_label
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import TrainingError
 from scene_envs.files import read_sealed
+from scene_envs.workers import Task, WorkerPool
 
 RUNS: Mapping[str, Sequence[str]] = {"clutter": ["recipe=demo_clutter"], "feasible": ["recipe=demo_feasible"]}
 """The two runs: their names, which are their folders and columns of the report, and their keys of ``post-train``."""
@@ -42,7 +41,7 @@ def run_demo(
     seed: int = 0,
     workers: int = 2,
     *,
-    device: str = "cpu",
+    device: str = "auto",
     progress: str = "bar",
     scenes: int = 24,
     num_steps: int = 50,
@@ -58,24 +57,32 @@ def run_demo(
 
     directory, started = Path(output), time.perf_counter()
     keys = [f"seed={seed}", f"workers={-(-workers // len(runs))}", "logger.report_scenes=0"]
-    keys += [f"device={device}", f"progress={progress}"]
-    commands = {name: [*words, *keys, f"output={directory / name}"] for name, words in runs.items()}
-    base: ScenePrior | None = None
-    results: dict[str, _Finished] = {}
-    measured: dict[str, Measured] = {}
-    with make_pool(workers, PHYSICS_TIMEOUT) as pool, _post_training(commands) as processes:
-        for name, process in processes.items():
-            if status := process.wait():
-                raise TrainingError(f"the run {name!r} ended with status {status}; its message stands above")
-            results[name] = run = _Finished(directory / name)
-            base = ScenePrior.load(run.config["prior"]) if base is None else base
-            for label, tested in {"base": base, name: ScenePrior.load(directory / name)}.items():
-                if label not in measured:  # the other run goes on while samples are measured
-                    print(f"measuring {scenes} samples of the prior {label!r}", file=sys.stderr, flush=True)
-                    measured[label] = measure_prior(
-                        tested, scenes, num_steps=num_steps, seed=seed + SAMPLE_SEED, pool=pool
-                    )
-    assert base is not None
+    keys += [f"device={device}", f"progress={progress}", "logger.checkpoint_every=1"]  # an interrupt ends runs at once
+    tasks = [
+        Task((name, [*words, *keys, f"output={directory / name}"]), f"the run {name!r}") for name, words in runs.items()
+    ]
+    threads = str(max(1, len(os.sched_getaffinity(0)) // len(runs)))
+    shares = {"OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
+    found: dict[str, Measured] = {}
+
+    def measure(task: Task, status: object) -> None:
+        """Measure a finished run, while the other goes on."""
+        if status != 0:
+            how = f"ended with status {status}; its message stands above" if isinstance(status, int) else status
+            raise TrainingError(f"{task.name} {how}")
+        name = task.body[0]
+        base = _Finished(directory / name).config["prior"]
+        for label, tested in {"base": base, name: directory / name}.items():
+            if label not in found:
+                print(f"measuring {scenes} samples of the prior {label!r}", file=sys.stderr, flush=True)
+                prior = cast(ScenePrior, resolve_prior(str(tested), device))
+                found[label] = measure_prior(prior, scenes, num_steps=num_steps, seed=seed + SAMPLE_SEED, pool=pool)
+
+    processes = WorkerPool("agents.cli.commands.demo:post_train_aloud", None, workers=len(runs), environment=shares)
+    with make_pool(workers, PHYSICS_TIMEOUT) as pool, processes:
+        processes.map(tasks, done=measure)
+    results = {name: _Finished(directory / name) for name in runs}
+    measured = {label: found[label] for label in ("base", *runs)}
     metrics = {
         **{name: part.figures for name, part in measured.items()},
         "runs": {name: run.metrics for name, run in results.items()},
@@ -84,7 +91,7 @@ def run_demo(
     }
     if left_out := _left_out(measured):
         metrics["left_out"] = left_out
-    write_report(directory / "report.html", _page(directory, base, results, measured))
+    write_report(directory / "report.html", _page(directory, results, measured))
     write_metrics(directory, metrics)
     return metrics
 
@@ -101,43 +108,7 @@ class _Finished:
         self.algorithm = self.config["algorithm"]["name"].upper().replace("_", "-")
 
 
-@contextmanager
-def _post_training(commands: Mapping[str, Sequence[str]]) -> Iterator[dict[str, subprocess.Popen[str]]]:
-    """Context in which ``scene-envs post-train`` runs with each list of keys, and with an equal part of the cores. Runs
-    that are not finished at the end of the context save and end.
-    """
-    threads = str(max(1, len(os.sched_getaffinity(0)) // len(commands)))
-    paths = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
-    environment = {"PYTHONPATH": paths, "PYTHONSAFEPATH": "1", "OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
-    processes: dict[str, subprocess.Popen[str]] = {}
-    readers: list[threading.Thread] = []
-    try:
-        for name, words in commands.items():
-            processes[name] = process = subprocess.Popen(
-                [sys.executable, "-m", "agents.cli", "post-train", *words], env=os.environ | environment, text=True,
-                errors="replace", stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C reaches this process alone, which then ends the others
-            )  # fmt: skip
-            readers.append(threading.Thread(target=_pass_on, args=(name, process), daemon=True))
-            readers[-1].start()
-        yield processes
-    finally:
-        for process in processes.values():
-            process.terminate()
-        for process, reader in zip(processes.values(), readers, strict=True):
-            process.wait()
-            reader.join()
-
-
-def _pass_on(name: str, process: subprocess.Popen[str]) -> None:
-    """Print each line that a process writes on stderr, with the name of its run."""
-    for line in process.stdout or ():
-        print(f"{name}: {line}", end="", file=sys.stderr, flush=True)
-
-
-def _page(
-    directory: Path, base: ScenePrior, results: Mapping[str, _Finished], measured: Mapping[str, Measured]
-) -> Page:
+def _page(directory: Path, results: Mapping[str, _Finished], measured: Mapping[str, Measured]) -> Page:
     """Content of the report; also writes its pictures to ``directory``."""
     runs = " and ".join(
         f"{run.goal} ({run.algorithm}, {run.metrics['iterations']} iterations)" for run in results.values()
@@ -172,7 +143,8 @@ def _page(
             [Picture(directory / name / "curve.png", f"{name}: {run.goal}") for name, run in results.items()],
         ),
     ]
-    title = f"{base.scene_type.name.replace('_', ' ').capitalize()}, steered two ways"
+    scene_type = measured["base"].raw.scene_type.name
+    title = f"{scene_type.replace('_', ' ').capitalize()}, steered two ways"
     lead = (
         f"One prior, post-trained toward {runs}, each with the pretraining loss on real scenes as regularisation. "
         f"All numbers are means over {count} fresh, seeded samples of each prior; none was selected."

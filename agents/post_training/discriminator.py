@@ -89,11 +89,8 @@ class Discriminator:
         )
 
     def begin(self, real: SceneBatch, seed: int) -> None:
-        """Start with an untrained network.
-
-        Args:
-            real: real scenes, of which the first 1,024 are kept.
-            seed: seed of the weights and of all draws.
+        """Start with an untrained network, whose weights and draws follow from ``seed``; of ``real`` scenes, the
+        first 1,024 are kept.
         """
         self._model = _Model(real[:_MAX_REAL_SCENES].to("cpu"), seed, self.learning_rate)
 
@@ -110,11 +107,16 @@ class Discriminator:
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimiser and latest samples."""
-        return self._begun().state()
+        model = self._begun()
+        parts = {"network": model.network.state_dict(), "optimizer": model.optimizer.state_dict()}
+        return deepcopy({**parts, "samples": model.samples, "updates": model.updates})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`, after :meth:`begin` with the same real scenes."""
-        self._begun().restore(state)
+        model = self._begun()
+        model.network.load_state_dict(state["network"])
+        model.optimizer.load_state_dict(state["optimizer"])
+        model.samples, model.updates = state["samples"], state["updates"]
 
     def _begun(self) -> _Model:
         if self._model is None:
@@ -166,12 +168,3 @@ class _Model:
         judged = tokens.present & ~torch.isin(tokens.categories, self.fixed)
         logits: Tensor = self.network(*self.typical.inputs(tokens))[judged]
         return logits
-
-    def state(self) -> dict[str, Any]:
-        parts = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict()}
-        return deepcopy({**parts, "samples": self.samples, "updates": self.updates})
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.network.load_state_dict(state["network"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.samples, self.updates = state["samples"], state["updates"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +15,7 @@ from agents.configuration.composition import changed
 from agents.post_training.algorithms.base import final_reward, gradient_norm
 from agents.post_training.algorithms.ddpo import DDPOSFLoss, accumulate_policy_gradient
 from agents.post_training.learner import Learner
-from agents.post_training.settings import AlgorithmSettings, GuidanceDistillationSettings, PostTrainConfig
+from agents.post_training.settings import GuidanceDistillationSettings, PostTrainConfig
 from agents.post_training.trainer import PostTrainer
 from agents.priors.prior import ScenePrior
 
@@ -69,7 +70,36 @@ class DoctorReport:
 
     def __rich__(self) -> RenderableType:
         """One screen for a terminal."""
-        return _screen(self)
+        from rich.columns import Columns
+        from rich.console import Group
+        from rich.panel import Panel
+        from rich.table import Table
+
+        table = Table("step", "t", "sigma", "weight", "|gradient|", box=None, header_style="bold", pad_edge=False)
+        for row in self.steps:
+            style = "" if row.weight > 0 else "dim"
+            norm = f"{row.gradient_norm:.3g}" if row.weight > 0 else "out"
+            table.add_row(str(row.step), str(row.timestep), f"{row.std:.4f}", f"{row.weight:.2f}", norm, style=style)
+        facts = Table(box=None, show_header=False, pad_edge=False)
+        length = self.iterations * (self.sampling_seconds + self.update_seconds) / 60
+        for name, value in (
+            *([("log-ratio at the start", f"{self.log_ratio:.3g}")] if self.steps else []),
+            ("reward", f"{self.reward_mean:.3g} ± {self.reward_std:.3g}"),
+            ("reward range", f"{self.reward_min:.3g} … {self.reward_max:.3g}"),
+            ("valid scenes", f"{self.valid_fraction:.0%}"),
+            ("policy gradient", f"{self.policy_gradient_norm:.3g}"),
+            ("regularisation gradient", f"{self.pretraining_gradient_norm:.3g}"),
+            ("their ratio", f"{self.gradient_ratio:.3g}"),
+            ("one batch, one update", f"{self.sampling_seconds:.1f} s, {self.update_seconds:.1f} s"),
+            (f"{self.iterations} iterations", f"about {length:.0f} min"),
+        ):
+            facts.add_row(name, f"[bold]{value}")
+        advice = "\n".join(f"[yellow]• {line}" for line in self.advice) or "[green]Nothing to change."
+        return Panel(
+            Group(Columns([table, facts] if self.steps else [facts], padding=(0, 6)), "", advice),
+            title="post-training doctor",
+            expand=False,
+        )
 
 
 def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> DoctorReport:
@@ -80,11 +110,8 @@ def diagnose(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> Doc
         real = config.regularisation
         bank = min(real.bank_size, config.guard.scenes + 4 * real.batch_size)
         small = changed(config, {"output": str(Path(scratch) / "run"), "regularisation.bank_size": bank})
-        trainer = PostTrainer(small, prior=prior)
-        try:
+        with closing(PostTrainer(small, prior=prior)) as trainer:
             return _examine(trainer)
-        finally:
-            trainer.close()
 
 
 def _examine(trainer: PostTrainer) -> DoctorReport:
@@ -98,14 +125,14 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
     steps, largest = _step_rows(learner, batch)
     reward, valid = final_reward(batch[:, -1])
     scored = reward[valid].double()
-    some = len(scored) > 0
+    scored = scored if len(scored) else scored.new_full((1,), float("nan"))
     report = DoctorReport(
         log_ratio=max(largest, row.get("log_ratio", 0.0)),
         steps=steps,
-        reward_mean=float(scored.mean()) if some else float("nan"),
-        reward_std=float(scored.std(unbiased=False)) if some else float("nan"),
-        reward_min=float(scored.min()) if some else float("nan"),
-        reward_max=float(scored.max()) if some else float("nan"),
+        reward_mean=float(scored.mean()),
+        reward_std=float(scored.std(unbiased=False)),
+        reward_min=float(scored.min()),
+        reward_max=float(scored.max()),
         valid_fraction=float(valid.double().mean()),
         policy_gradient_norm=row["policy_gradient_norm"],
         pretraining_gradient_norm=row["pretraining_gradient_norm"],
@@ -113,9 +140,7 @@ def _examine(trainer: PostTrainer) -> DoctorReport:
         update_seconds=updated - sampled,
         iterations=trainer.config.iterations,
     )
-    config = trainer.config
-    weight = config.regularisation.pretraining_weight
-    return replace(report, advice=_advice(report, config.algorithm, weight, config.prompt is not None))
+    return replace(report, advice=_advice(report, trainer.config))
 
 
 def _step_rows(learner: Learner, batch: TensorDictBase) -> tuple[list[StepRow], float]:
@@ -137,7 +162,8 @@ def _step_rows(learner: Learner, batch: TensorDictBase) -> tuple[list[StepRow], 
     return rows, largest
 
 
-def _advice(report: DoctorReport, algorithm: AlgorithmSettings, weight: float, prompted: bool) -> list[str]:
+def _advice(report: DoctorReport, config: PostTrainConfig) -> list[str]:
+    algorithm, weight = config.algorithm, config.regularisation.weight or 0.0
     advice = []
     if report.log_ratio != 0:
         advice.append(
@@ -153,7 +179,7 @@ def _advice(report: DoctorReport, algorithm: AlgorithmSettings, weight: float, p
         advice.append(
             "The rewards differ between prompts but not within any: there is nothing to learn. Raise scenes_per_prompt "
             f"from {algorithm.scenes_per_prompt}, or use a reward that differs between scenes of one prompt."
-            if prompted
+            if config.prompt is not None
             else "The rewards differ, but no advantage does: there is nothing to learn. Another algorithm.credit may "
             "help."
         )
@@ -172,46 +198,10 @@ def _advice(report: DoctorReport, algorithm: AlgorithmSettings, weight: float, p
         return advice
     worst = max(report.steps, key=lambda row: row.gradient_norm)
     total = sum(row.gradient_norm**2 for row in report.steps)
-    if (
-        total > 0
-        and worst.gradient_norm**2 > MAX_STEP_SHARE * total
-        and sum(row.weight > 0 for row in report.steps) > 2
-    ):
+    many = sum(row.weight > 0 for row in report.steps) > 2
+    if many and total > 0 and worst.gradient_norm**2 > MAX_STEP_SHARE * total:
         advice.append(
             f"Step {worst.step} (sigma {worst.std:.3g}) alone is {worst.gradient_norm**2 / total:.0%} of the squared "
             f"policy gradient: raise algorithm.min_std."
         )
     return advice
-
-
-def _screen(report: DoctorReport) -> RenderableType:
-    from rich.columns import Columns
-    from rich.console import Group
-    from rich.panel import Panel
-    from rich.table import Table
-
-    table = Table("step", "t", "sigma", "weight", "|gradient|", box=None, header_style="bold", pad_edge=False)
-    for row in report.steps:
-        style = "" if row.weight > 0 else "dim"
-        norm = f"{row.gradient_norm:.3g}" if row.weight > 0 else "out"
-        table.add_row(str(row.step), str(row.timestep), f"{row.std:.4f}", f"{row.weight:.2f}", norm, style=style)
-    facts = Table(box=None, show_header=False, pad_edge=False)
-    length = report.iterations * (report.sampling_seconds + report.update_seconds) / 60
-    for name, value in (
-        *([("log-ratio at the start", f"{report.log_ratio:.3g}")] if report.steps else []),
-        ("reward", f"{report.reward_mean:.3g} ± {report.reward_std:.3g}"),
-        ("reward range", f"{report.reward_min:.3g} … {report.reward_max:.3g}"),
-        ("valid scenes", f"{report.valid_fraction:.0%}"),
-        ("policy gradient", f"{report.policy_gradient_norm:.3g}"),
-        ("regularisation gradient", f"{report.pretraining_gradient_norm:.3g}"),
-        ("their ratio", f"{report.gradient_ratio:.3g}"),
-        ("one batch, one update", f"{report.sampling_seconds:.1f} s, {report.update_seconds:.1f} s"),
-        (f"{report.iterations} iterations", f"about {length:.0f} min"),
-    ):
-        facts.add_row(name, f"[bold]{value}")
-    advice = "\n".join(f"[yellow]• {line}" for line in report.advice) or "[green]Nothing to change."
-    return Panel(
-        Group(Columns([table, facts] if report.steps else [facts], padding=(0, 6)), "", advice),
-        title="post-training doctor",
-        expand=False,
-    )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import derived_seed
@@ -20,8 +20,8 @@ _AT_ONCE = 32
 """Number of scenes sampled together."""
 _CLASSIFIERS = 3
 """Number of classifiers over which the accuracy is averaged."""
-_CHUNK = 256
-"""Number of held-out scenes with prompts per pass."""
+_STATE = ("base_loss", "base_samples", "best_reward", "best_score", "best_iteration")
+"""Attributes of a guard that are kept in a checkpoint, beside its readings."""
 
 
 class Guard:
@@ -38,7 +38,7 @@ class Guard:
         heldout: (K, N, D) normalised real scenes that are not used by the regularisation.
         limit: largest ratio before the run counts as over-optimised; no checkpoint above it is kept.
         seed: seed of the fixed timesteps and noise.
-        prompts: one prompt of each held-out scene; None measures without prompts.
+        prompts: gives one prompt of each held-out scene; the loss is measured without prompts where it gives None.
         samples: settings for sampling and measuring; None measures the loss alone.
         limits: largest excess of each figure of samples over that of the base prior, by name.
         target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
@@ -57,21 +57,17 @@ class Guard:
         heldout: Tensor,
         limit: float,
         seed: int,
-        prompts: Sequence[str] | None = None,
+        prompts: Callable[[], Sequence[str] | None] = lambda: None,
         samples: SampleCheck | None = None,
         limits: Mapping[str, float] | None = None,
         target: float = math.inf,
         learns: bool = False,
     ) -> None:
-        self.heldout = heldout
-        self.prompts = prompts
-        self.limit, self.target = limit, target
-        self.learns = learns
-        self.seed = seed
-        self.samples = samples
-        self.limits = dict(limits or {})
+        self.heldout, self.prompts, self.samples = heldout, prompts, samples
+        self.limit, self.target, self.limits = limit, target, dict(limits or {})
+        self.learns, self.seed = learns, seed
         self.base_loss = float("nan")
-        self.base_figures: dict[str, float] = {}
+        self.base_samples: dict[str, float] = {}
         self.last_samples: SceneBatch | None = None
         self.readings: list[GuardReading] = []
         self.best_reward = self.best_score = float("-inf")
@@ -79,11 +75,11 @@ class Guard:
 
     def start(self, base: ScenePrior) -> None:
         """Measure the base prior."""
-        self.base_loss, self.base_figures = self._measure(base, sample=True)
-        if self.base_figures:
-            reward = self.base_figures["sample_reward"]
+        self.base_loss, self.base_samples = self._measure(base, sample=True)
+        if self.base_samples:
+            reward = self.base_samples["sample_reward"]
             self.best_reward = float("-inf") if math.isnan(reward) else reward  # so that every reward is larger
-            self.best_score = self._score(self.best_reward, self.base_figures)
+            self.best_score = self._score(self.best_reward, self.base_samples)
 
     def _score(self, reward: float, figures: Mapping[str, float]) -> float:
         """Score by which checkpoints are compared; larger is better."""
@@ -91,31 +87,19 @@ class Guard:
 
     def _measure(self, prior: ScenePrior, sample: bool) -> tuple[float, dict[str, float]]:
         """The loss, and figures of samples if the guard samples; all processes get the values of the first process."""
-        check = self.samples if sample else None
-        batch = None if check is None else check.sample(prior)
-        if batch is not None:
-            self.last_samples = batch
-
-        def measured() -> tuple[float, dict[str, float]]:
-            return self.loss(prior), {} if check is None or batch is None else check.figures(batch)
-
-        return ProcessGroup.current().from_first(measured)
+        batch, check = None, self.samples
+        if sample and check is not None:
+            batch = self.last_samples = check.sample(prior)
+        return ProcessGroup.current().from_first(
+            lambda: (self.loss(prior), {} if check is None or batch is None else check.figures(batch))
+        )
 
     @torch.no_grad()
     def loss(self, prior: ScenePrior) -> float:
         """Pretraining loss on the held-out scenes; the same timesteps and noise at every call."""
         from agents.pretraining.trainer import heldout_loss
 
-        device = next(prior.parameters()).device
-        if self.prompts is not None:
-            generator = Generator().manual_seed(self.seed)
-            chunks = [self.prompts[start : start + _CHUNK] for start in range(0, len(self.heldout), _CHUNK)]
-            losses = [
-                prior.pretraining_loss(x0.to(device), generator, "none", text=prior.encode_prompts(prompts))
-                for x0, prompts in zip(self.heldout.split(_CHUNK), chunks, strict=True)
-            ]
-            return float(torch.cat(losses).mean())
-        return heldout_loss(prior, self.heldout.to(device), seed=self.seed)
+        return heldout_loss(prior, self.heldout.to(prior.device), self.prompts(), self.seed)
 
     def check(
         self,
@@ -126,21 +110,16 @@ class Guard:
         *,
         sample: bool = True,
     ) -> GuardReading:
-        """Measure ``prior``; the reading says whether it is the best so far.
-
-        Args:
-            prior: prior with the weights that are evaluated and saved.
-            iteration: number of the finished iteration.
-            reward: mean over the batches since the check before.
-            realism: further figures, kept with the reading.
-            sample: whether this check samples; ignored if the guard never samples.
+        """Measure ``prior``, which has the weights that are evaluated and saved, after ``iteration`` iterations; the
+        reading says whether it is the best so far. ``reward`` is the mean over the batches since the check before,
+        ``realism`` has further figures for the reading, and ``sample`` says whether a guard that samples does so now.
         """
         loss, figures = self._measure(prior, sample)
         ratio = loss / self.base_loss
         over = [] if ratio <= self.limit else ["loss"]
         if figures:
             reward = figures["sample_reward"]
-            over += beyond(figures, self.base_figures, self.limits)
+            over += beyond(figures, self.base_samples, self.limits)
         counts = self.samples is None or sample
         score = self._score(reward, figures)
         kept = counts and not over and ratio <= self.target and score > self.best_score  # False for NaN
@@ -172,7 +151,7 @@ class Guard:
             "last_ratio": self.ratio,
             "limit": self.limit,
             "base_loss": self.base_loss,
-            "base_samples": self.base_figures,
+            "base_samples": self.base_samples,
             "sample_limits": self.limits,
             "best_iteration": self.best_iteration,
             "over_optimised_from": self.over_limit_at,
@@ -181,21 +160,14 @@ class Guard:
 
     def state(self) -> dict[str, Any]:
         """State for a checkpoint."""
-        return {
-            "base_loss": self.base_loss,
-            "base_samples": self.base_figures,
-            "readings": [dict(vars(reading)) for reading in self.readings],
-            "best_reward": self.best_reward,
-            "best_score": self.best_score,
-            "best_iteration": self.best_iteration,
-        }
+        readings = [dict(vars(reading)) for reading in self.readings]
+        return {**{name: getattr(self, name) for name in _STATE}, "readings": readings}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
-        self.base_loss, self.base_figures = state["base_loss"], state["base_samples"]
+        for name in _STATE:
+            setattr(self, name, state[name])
         self.readings = [GuardReading(**reading) for reading in state["readings"]]
-        self.best_reward, self.best_iteration = state["best_reward"], state["best_iteration"]
-        self.best_score = state["best_score"]
 
 
 @dataclass(frozen=True)

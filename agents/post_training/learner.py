@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -36,6 +36,7 @@ from rewards import (
 )
 from rewards.evaluation import evaluate_reward
 from rewards.process import close_reward
+from scene_envs.arrays import Result, within_memory
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.scoring import RewardScorer
 from scene_envs.errors import RewardError
@@ -120,6 +121,19 @@ class Learner:
             prompts = self.deck.deal(self.batch_size, self._generator("prompts", iteration))[rows]
         policy = self.algorithm.sampling_policy
         return collect(self.env, policy, seed=self.seed, iteration=iteration, prompts=prompts)
+
+    def in_memory(self, work: Callable[[], Result]) -> Result:
+        """``work()``; where the memory is too small for it, an InvalidInputError gives an ``optimizer.chunk`` that
+        fits. With several processes, which work together, nothing is tried.
+        """
+        size = self.policy.chunk or self.batch_size
+
+        def tried(chunk: int) -> Result:
+            if chunk < size:
+                self.policy.chunk = self.algorithm.sampling_policy.chunk = chunk
+            return work()
+
+        return work() if self.processes.size > 1 else within_memory(tried, size, "optimizer.chunk")
 
     def write_advantage(self, batch: TensorDict) -> TensorDict:
         """The batch with the advantages that the algorithm's loss reads, if it reads any."""

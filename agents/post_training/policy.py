@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -102,21 +102,14 @@ class DenoisingPolicy(TensorDictModuleBase):
     def distribution(self, x_t: Tensor, step: int, text: Text | None = None) -> ReverseStep:
         """p(x_{t-1} | x_t) of ``x_t`` (B, N, D) given ``text``; differentiable in the prior's parameters."""
         size = self.chunk or x_t.shape[0]
-        return concatenate_steps(
-            [
-                self._transition(x_t[rows], step, None if text is None else (text[0][rows], text[1][rows]))
-                for rows in (slice(start, start + size) for start in range(0, x_t.shape[0], size))
-            ]
-        )
-
-    def _transition(self, x_t: Tensor, step: int, text: Text | None) -> ReverseStep:
-        reverse: ReverseStep
-        if text is None:
-            reverse = self.prior.transition(x_t, step, self.table)
-        else:
-            prior = cast(PromptedPriorLike, self.prior)
-            reverse = prior.transition(x_t, step, self.table, text=text, guidance=self.guidance)
-        return reverse.independent() if self.independent and isinstance(reverse, MixedStep) else reverse
+        prior, parts = cast(PromptedPriorLike, self.prior), []
+        for rows in (slice(start, start + size) for start in range(0, x_t.shape[0], size)):
+            how: dict[str, Any] = (
+                {} if text is None else {"text": (text[0][rows], text[1][rows]), "guidance": self.guidance}
+            )
+            reverse: ReverseStep = prior.transition(x_t[rows], step, self.table, **how)
+            parts.append(reverse.independent() if self.independent and isinstance(reverse, MixedStep) else reverse)
+        return concatenate_steps(parts)
 
     @torch.no_grad()
     def draw(
@@ -176,10 +169,8 @@ class DenoisingPolicy(TensorDictModuleBase):
         return tensordict
 
 
-def gradient_weights(
-    stds: Tensor, *, min_std: float = 1e-2, skip_first: float = 0.0, weighting: str = "uniform"
-) -> Tensor:
-    """(S,) weight of every step in the policy gradient; 0 leaves a step out.
+def gradient_weights(stds: Tensor, *, min_std: float = 1e-2) -> Tensor:
+    """(S,) weight of every step in the policy gradient: 1, or 0 where the step is left out.
 
     A step whose sigma is below ``min_std`` is sampled with that sigma but excluded from the gradient. Its log-density
     is so steep that millimetres of noise outweigh the reward. (Raising the sigma of the *sampler* to ``min_std``
@@ -188,24 +179,16 @@ def gradient_weights(
     Args:
         stds: (S,) sigma of every step, normalised units.
         min_std: smallest sigma of a step in the gradient.
-        skip_first: fraction of the chain, from its noisy end, that stays out of the gradient.
-        weighting: ``"uniform"``, ``"std"`` (proportional to sigma) or ``"variance"`` (to sigma squared);
-            weights of the steps in the gradient have mean 1.
 
     >>> gradient_weights(torch.tensor([0.6, 0.2, 0.005, 0.0])).tolist()
     [1.0, 1.0, 0.0, 0.0]
     """
-    powers = {"uniform": 0.0, "std": 1.0, "variance": 2.0}
-    if weighting not in powers:
-        raise InvalidInputError(f"step_weighting={weighting!r} is not known; use one of {', '.join(powers)}")
     if min_std <= 0:
         raise InvalidInputError(f"min_std={min_std} must be positive: the last step is deterministic")
     taken = stds >= min_std
-    taken[: round(skip_first * len(stds))] = False
     if not bool(taken.any()):
         raise InvalidInputError(
-            f"no step is left in the policy gradient: min_std={min_std}, skip_first={skip_first}, "
-            f"and the sigmas of the chain are {[round(float(s), 4) for s in stds]}"
+            f"no step is left in the policy gradient: min_std={min_std}, and the sigmas of the chain are "
+            f"{[round(float(s), 4) for s in stds]}"
         )
-    weight = torch.where(taken, stds ** powers[weighting], torch.zeros_like(stds))
-    return weight / weight[taken].mean()
+    return taken.to(stds)

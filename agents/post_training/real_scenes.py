@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,20 +13,25 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from agents.post_training.rollouts import PROMPTS_NAME, PromptSets, save_prompts, stream_seed
-from agents.post_training.run_files import BASE_SAMPLES_NAME, SCENES_NAME, writing
+from agents.post_training.rollouts import PROMPTS_NAME, PromptSets, stream_seed
+from agents.post_training.run_files import BASE_SAMPLES_NAME, SCENES_NAME, write_text, writing
 from agents.post_training.settings import RegularisationSettings
 from agents.priors.prior import ScenePrior, asked_objects
 from agents.utils.process_group import ProcessGroup
-from scene_envs.errors import InvalidInputError
+from scene_envs import __version__
+from scene_envs.errors import InvalidInputError, SceneEnvsError
+from scene_envs.files import cache_folder, trim_folder
 from scene_envs.progress import Progress
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 
+_LOGGER = logging.getLogger(__name__)
 _WITHHELD = 0.1
 """Share of real scenes whose prompt is withheld, as in pretraining."""
-_AT_ONCE = 64
-"""Number of scenes of the grammar between two updates of the progress."""
+_AT_ONCE = 16
+"""Number of scenes of the grammar between two updates of the progress; as many are compared with kept scenes."""
+_CACHE_SIZE = 512 * 2**20
+"""Bytes of the grammar's scenes that are kept for later runs."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +114,9 @@ def kept_scenes(
         writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
         texts.unlink(missing_ok=True)  # prompts of other scenes, left by a run without a checkpoint
         if found is not None and prior.conditional:
-            writing(f"their prompts {str(texts)!r}", lambda: save_prompts(texts, found))
+            write_text(texts, json.dumps([list(prompts) for prompts in found]) + "\n")
+        processes.wait()
+        return batch
     processes.wait()
     return SceneBatch.load(path)
 
@@ -121,15 +131,7 @@ def real_scenes(
     """
     slots = max(prior.scene_type.slots, prior.config.slots if slots is None else slots)
     if source == "grammar":
-        from scene_envs.grammars import get_grammar
-
-        rng, grammar, parts, title = np.random.default_rng(seed), get_grammar(prior.scene_type), [], "real scenes"
-        with Progress(title, count, style=progress) as shown:
-            for first in range(0, count, _AT_ONCE):
-                parts.append(grammar.sample(rng, min(_AT_ONCE, count - first)))
-                done = first + len(parts[-1])
-                shown.update(done, "", f"{title} {done}/{count}")
-        return SceneBatch.concatenate(parts).with_slots(slots), None
+        return _grammar_scenes(prior.scene_type, count, seed, progress).with_slots(slots), None
     from scene_envs.datasets import SceneDataset
 
     if not Path(source).is_dir():
@@ -138,6 +140,43 @@ def real_scenes(
     rows = torch.randperm(len(dataset.tensor), generator=Generator().manual_seed(seed))[:count]
     batch = SceneBatch(dataset.tensor[rows], prior.scene_type)
     return batch.with_slots(max(slots, batch.tensor.shape[1])), [dataset.prompt_sets[i] for i in rows.tolist()]
+
+
+def _grammar_scenes(scene_type: SceneType, count: int, seed: int, progress: str) -> SceneBatch:
+    """``count`` scenes of the grammar, from the cache if an earlier run kept them. The first ones are drawn in any
+    case, so that kept scenes of another grammar are noticed.
+    """
+    from scene_envs import grammars
+
+    rng, grammar, title = np.random.default_rng(seed), grammars.get_grammar(scene_type), "real scenes"
+    parts = [grammar.sample(rng, min(_AT_ONCE, count))]
+    key = hashlib.sha256(f"{__version__} {np.__version__}".encode())
+    for file in sorted(Path(grammars.__path__[0]).glob("*.py")):
+        key.update(file.read_bytes())
+    path = cache_folder() / "real_scenes" / f"{scene_type.name}-{seed}-{count}-{key.hexdigest()[:16]}.safetensors"
+    try:
+        kept = SceneBatch.load(path).tensor if path.exists() else None
+        if kept is not None and len(kept) == count and torch.equal(kept[: len(parts[0])], parts[0].tensor):
+            path.touch()  # those used last are kept longest
+            return SceneBatch(kept, scene_type)
+        reason = "" if kept is None else "the grammar draws others now"
+    except (SceneEnvsError, OSError) as error:
+        reason = str(error)
+    if reason:
+        _LOGGER.warning("the real scenes kept in %s are not taken and drawn anew: %s", path, reason)
+    with Progress(title, count, style=progress) as shown:
+        for first in range(_AT_ONCE, count, _AT_ONCE):
+            parts.append(grammar.sample(rng, min(_AT_ONCE, count - first)))
+            done = first + len(parts[-1])
+            shown.update(done, "", f"{title} {done}/{count}")
+    batch = SceneBatch.concatenate(parts)
+    if len(parts) > 1:
+        try:
+            batch.save(path)
+            trim_folder(path.parent, _CACHE_SIZE)
+        except OSError as error:
+            _LOGGER.warning("real scenes could not be kept in %s: %s", path.parent, error)
+    return batch
 
 
 def kept_base_samples(

@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from agents.networks.text import Text
-from agents.post_training.algorithms.base import GradientSum, gradient_norm
+from agents.post_training.algorithms.base import gradient_norm, in_parts
 from agents.post_training.real_scenes import PromptedScenes
 from agents.post_training.settings import RegularisationSettings
 from agents.priors.prior import NoisedScenes, ScenePrior
@@ -58,7 +58,7 @@ class Regularisation:
     @property
     def weight(self) -> float:
         """Coefficient of the pretraining loss on real scenes."""
-        return self.settings.pretraining_weight * self.state.factor
+        return (self.settings.weight or 0.0) * self.state.factor
 
     def accumulate(
         self,
@@ -73,26 +73,19 @@ class Regularisation:
         (CPU). ``chunk`` is the number of scenes per pass.
         """
 
-        def add(scenes: PromptedScenes, generator: Generator, loss: SceneLoss | None) -> tuple[float, float]:
-            return add_regularisation_gradient(
-                prior, scenes.scenes, self.weight, generator, loss=loss, chunk=chunk, prompts=scenes.prompts
-            )
-
-        held = {} if self.target is None else {"regularisation_weight": self.weight, "hold_factor": self.state.factor}
-        if base is None or self.base is None:
-            value, norm = add(real, generator, None)
-            return {"pretraining_loss": value, "pretraining_gradient_norm": norm, **held}
-        loss = DiscriminativeLoss(prior, self.base, SHARPNESS)
-        same = Generator().set_state(generator.get_state())
-        value, norm = add(real, generator, loss.of_real)
-        base_value, base_norm = add(base, same, loss.of_base)
-        return {
-            "pretraining_loss": value,
-            "pretraining_gradient_norm": norm,
-            "base_sample_loss": base_value,
-            "base_sample_gradient_norm": base_norm,
-            **held,
-        }
+        parts: dict[str, tuple[PromptedScenes, SceneLoss | None]] = {"pretraining": (real, None)}
+        if base is not None and self.base is not None:
+            loss = DiscriminativeLoss(prior, self.base, SHARPNESS)
+            parts = {"pretraining": (real, loss.of_real), "base_sample": (base, loss.of_base)}
+        row, begun = {}, generator.get_state()
+        for name, (scenes, of) in parts.items():
+            row[f"{name}_loss"], row[f"{name}_gradient_norm"] = add_regularisation_gradient(
+                prior, scenes.scenes, self.weight, generator.set_state(begun), loss=of, chunk=chunk,
+                prompts=scenes.prompts,
+            )  # fmt: skip
+        if self.target is not None:
+            row |= {"regularisation_weight": self.weight, "hold_factor": self.state.factor}
+        return row
 
     def observe(self, ratio: float, iteration: int) -> None:
         """Adjust the weight after a check of the guard, whose held-out loss is ``ratio`` times the base prior's."""
@@ -170,19 +163,15 @@ def add_regularisation_gradient(
     before = [p.grad for p in parameters]
     for parameter in parameters:
         parameter.grad = None
-    value, total = 0.0, GradientSum(parameters)
+    value, losses = 0.0, loss or prior.noised_loss
     noised, own = prior.noised(x0, generator), processes.rows(len(x0))
-    losses = loss or prior.noised_loss
-    size = chunk or len(x0)
-    for start in range(own.start, own.stop, size):
-        rows = slice(start, min(start + size, own.stop))
+    for part in in_parts(parameters, own.stop - own.start, chunk):
+        rows = slice(own.start + part.start, own.start + part.stop)
         with torch.no_grad():
             text = None if prompts is None else prior.encode_prompts(prompts[rows])
-        mean = losses(noised.rows(rows), text).mean() * ((rows.stop - start) / len(x0))
+        mean = losses(noised.rows(rows), text).mean() * ((part.stop - part.start) / len(x0))
         value += float(mean.detach())
         (coefficient * mean).backward()
-        total.add_part()
-    total.write()
     processes.sum_gradients(parameters)
     norm = gradient_norm(parameters)
     for parameter, gradient in zip(parameters, before, strict=True):

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,20 +19,18 @@ from agents.post_training.guard import realism
 from agents.post_training.rollouts import PromptDeck, run_prompts, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
-    FAINT,
-    GUARD_COLOR,
-    REWARD_COLOR,
     SCENES_NAME,
     write_metrics,
     write_text,
 )
-from agents.post_training.settings import PostTrainConfig, held_ratio
+from agents.post_training.settings import PostTrainConfig
 from agents.post_training.trainer import PostTrainResult, post_train
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import load_checkpoint
 from agents.utils.process_group import ProcessGroup
 from rewards import PromptMatch, RewardContext, RewardOutput, evaluate_reward, learned_parts, reward_label
 from rewards.process import close_reward
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.files import page_part, page_template
 from scene_envs.scene import SceneBatch
 
@@ -100,7 +98,7 @@ def post_train_and_compare(
             print(text, file=sys.stderr, flush=True)
 
     started = time.perf_counter()
-    base = ScenePrior.load(config.prior if prior is None else prior)
+    base = cast(ScenePrior, resolve_prior(config.prior if prior is None else prior, config.device))
     result = post_train(config, prior=base)
     if not ProcessGroup.current().is_first:
         return result.metrics
@@ -108,8 +106,11 @@ def post_train_and_compare(
     seed = config.seed + SAMPLE_SEED
     directory, slots = config.directory, base.config.slots if config.slots is None else config.slots
     prompts = None
-    if config.prompt is not None:
-        prompts = _measured_prompts(directory, base, config.prompt, scenes, slots, config.seed)
+    if config.prompt is not None:  # one per sample, from the source of the run's prompts
+        batch = SceneBatch.load(directory / SCENES_NAME)
+        real = run_prompts(directory, batch, stream_seed(config.seed, "bank"))
+        deck = PromptDeck.of(base, config.prompt, 1, slots, real, len(batch))
+        prompts = deck.deal(scenes, Generator().manual_seed(seed))
     reward = config.resolved_reward()
     with make_pool(config.workers, PHYSICS_TIMEOUT, config.physics) as pool, ExitStack() as stack:
         stack.callback(close_reward, reward)
@@ -127,9 +128,15 @@ def post_train_and_compare(
         after = measure(result.prior)
     seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
     say("drawing the report")
-    title = f"Steering {base.scene_type.name.replace('_', ' ')} toward {reward_label(config.reward)}"
-    extra = {"stage_seconds": seconds, "num_steps": num_steps}
-    return _write_comparison(result, before, after, title, extra)
+    names = [name for name in ("reward", "objects", "feasible_objects", "ready_objects") if name in before.figures]
+    change = {name: _relative(before.figures[name], after.figures.get(name)) for name in names}
+    metrics = {"before": before.figures, "after": after.figures, "change": change, **result.metrics}
+    metrics |= {"stage_seconds": seconds, "num_steps": num_steps}
+    if left_out := {**before.left_out, **after.left_out}:
+        metrics["left_out"] = left_out
+    write_report(directory / "report.html", _page(result, before, after, metrics))
+    write_metrics(directory, metrics)
+    return metrics
 
 
 def load_learned_rewards(reward: Any, directory: Path, heldout: int, seed: int) -> None:
@@ -142,39 +149,6 @@ def load_learned_rewards(reward: Any, directory: Path, heldout: int, seed: int) 
         for part, own in zip(parts, state, strict=True):
             part.begin(real[: len(real) - heldout], stream_seed(seed, "discriminator"))
             part.load_state_dict(own)
-
-
-def _measured_prompts(directory: Path, prior: ScenePrior, prompt: Any, count: int, slots: int, seed: int) -> list[str]:
-    """One prompt per measured sample, from the source of the run's prompts."""
-    batch = SceneBatch.load(directory / SCENES_NAME)
-    real = run_prompts(directory, batch, stream_seed(seed, "bank"))
-    deck = PromptDeck.of(prior, prompt, 1, slots, real, len(batch))
-    return deck.deal(count, Generator().manual_seed(seed + SAMPLE_SEED))
-
-
-def _write_comparison(
-    result: PostTrainResult, before: Measured, after: Measured, title: str, extra: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Write pictures, page and metrics to the run folder; returns the metrics, with the relative ``change``."""
-    directory, settings = result.directory, result.config.plain()
-    names = [name for name in ("reward", "objects", "feasible_objects", "ready_objects") if name in before.figures]
-    change = {name: _relative(before.figures[name], after.figures.get(name)) for name in names}
-    metrics = {"before": before.figures, "after": after.figures, "change": change, **result.metrics, **extra}
-    left_out = {**before.left_out, **after.left_out}
-    if left_out:
-        metrics["left_out"] = left_out
-    pictures = {}
-    for name, part in {"before": before, "after": after}.items():
-        pictures[name] = draw_gallery(part.raw, directory / f"{name}.png")
-        if part.ready is not None:
-            pictures[f"{name}_ready"] = draw_gallery(part.ready, directory / f"{name}_ready.png", part.is_ready)
-    for name in ("guard_within", "guard_beyond"):
-        if (path := directory / f"{name}.safetensors").exists():
-            pictures[name] = draw_gallery(SceneBatch.load(path), directory / f"{name}.png")
-    held = hold_sections(metrics.get("hold"), result.history, directory / "hold.png")
-    write_report(directory / "report.html", _page(title, metrics, directory / "curve.png", pictures, settings, held))
-    write_metrics(directory, metrics)
-    return metrics
 
 
 @dataclass(frozen=True)
@@ -214,7 +188,7 @@ def measure_prior(
     raw = prior.sample(
         count, prompt=prompts, guidance=guidance, claim_guidance=claim_guidance, physics_guidance=0.0,
         num_steps=num_steps, slots=slots, seed=seed,
-    )  # fmt: skip
+    ).to("cpu")  # fmt: skip
     left_out: dict[str, str] = {}
     ready: ReadyResult | None = None
     scored: RewardOutput | None = None
@@ -275,41 +249,38 @@ def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) 
     """Draw the first scenes of ``batch`` with their counts as a PNG; with ``is_ready`` (B, N), captions count these
     objects, and the other free objects are red.
     """
-    images, captions = _drawn(batch, is_ready, _GALLERY)
-    return _save_gallery(images, captions, path)
+    return _draw_columns({"": (batch, is_ready)}, path, _GALLERY)
 
 
 def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bool = False) -> Path:
     """Draw the first scenes of up to three priors, by caption and from the same noise, as a PNG: a row per scene, a
     column per prior. ``ready`` shows them after projection and settling, with objects that are not ready in red.
     """
-    shown = [(part.ready, part.is_ready) if ready else (part.raw, None) for part in measured.values()]
-    drawn = [_drawn(batch, is_ready, _GALLERY // 2) for batch, is_ready in shown if batch is not None]
-    images = [image for row in zip(*(images for images, _ in drawn), strict=True) for image in row]
-    texts = zip(*(captions for _, captions in drawn), strict=True)
-    captions = [f"{name}: {text}" for row in texts for name, text in zip(measured, row, strict=True)]
-    return _save_gallery(images, captions, path)
+    if ready:
+        shown = {name: (part.ready, part.is_ready) for name, part in measured.items() if part.ready is not None}
+    else:
+        shown = {name: (part.raw, None) for name, part in measured.items()}
+    return _draw_columns(shown, path, _GALLERY // 2)
 
 
-def _drawn(batch: SceneBatch, is_ready: Tensor | None, count: int) -> tuple[NDArray[np.uint8], list[str]]:
-    """Images (b, H, W, 3) of the first ``count`` scenes, and a caption for each."""
-    from scene_envs.render import render
+def _draw_columns(shown: Mapping[str, tuple[SceneBatch, Tensor | None]], path: Path, count: int) -> Path:
+    """Draw the first ``count`` scenes of batches, in columns if there are several, with names in their captions."""
+    from scene_envs.render import gallery, render
 
-    shown = batch[:count]
-    width, height = _TILE
-    if is_ready is None:
-        return render(shown, width=width, height=height), [f"{count} objects" for count in shown.counts.tolist()]
-    ready = is_ready[: len(shown)].cpu()
-    images = render(shown, width=width, height=height, highlight=shown.is_free.cpu() & ~ready)
-    free = shown.is_free.sum(dim=-1).tolist()
-    return images, [f"{good} of {total} ready" for good, total in zip(ready.sum(dim=-1).tolist(), free, strict=True)]
-
-
-def _save_gallery(images: Sequence[NDArray[np.uint8]] | NDArray[np.uint8], captions: list[str], path: Path) -> Path:
-    from scene_envs.render import gallery
-
+    drawn: list[list[tuple[NDArray[np.uint8], str]]] = []
+    for name, (batch, is_ready) in shown.items():
+        batch, free = batch[:count], batch[:count].is_free.cpu()
+        red, texts = None, [f"{objects} objects" for objects in batch.counts.tolist()]
+        if is_ready is not None:
+            ready = is_ready[: len(batch)].cpu()
+            counts = zip(ready.sum(dim=-1).tolist(), free.sum(dim=-1).tolist(), strict=True)
+            red, texts = free & ~ready, [f"{good} of {total} ready" for good, total in counts]
+        images = render(batch, width=_TILE[0], height=_TILE[1], highlight=red)
+        prefix = f"{name}: " if name else ""
+        drawn.append([(image, prefix + text) for image, text in zip(images, texts, strict=True)])
+    tiles, captions = zip(*(tile for row in zip(*drawn, strict=True) for tile in row), strict=True)
     path.parent.mkdir(parents=True, exist_ok=True)
-    gallery(images, columns=_COLUMNS, captions=captions).quantize(192).save(path, optimize=True)
+    gallery(tiles, columns=_COLUMNS, captions=captions).quantize(192).save(path, optimize=True)
     return path
 
 
@@ -360,30 +331,32 @@ def write_report(path: Path, page: Page) -> Path:
     return path
 
 
-def _page(
-    title: str,
-    metrics: Mapping[str, Any],
-    curve: Path,
-    pictures: Mapping[str, Path],
-    settings: Mapping[str, Any],
-    held: Sequence[Section],
-) -> Page:
-    reward = reward_label(settings["reward"])
-    algorithm = settings["algorithm"]["name"].upper().replace("_", "-")
-    before, after, guard = metrics["before"], metrics["after"], metrics["guard"]
-    count = int(before["scenes"])
+def _page(result: PostTrainResult, before: Measured, after: Measured, metrics: Mapping[str, Any]) -> Page:
+    """Content of the report; also writes its pictures to the run folder."""
+    directory, settings = result.directory, result.config.plain()
+    pictures = {}
+    for name, part in {"before": before, "after": after}.items():
+        pictures[name] = draw_gallery(part.raw, directory / f"{name}.png")
+        if part.ready is not None:
+            pictures[f"{name}_ready"] = draw_gallery(part.ready, directory / f"{name}_ready.png", part.is_ready)
+    for name in ("guard_within", "guard_beyond"):
+        if (path := directory / f"{name}.safetensors").exists():
+            pictures[name] = draw_gallery(SceneBatch.load(path), directory / f"{name}.png")
+    reward, algorithm = reward_label(settings["reward"]), settings["algorithm"]["name"].upper().replace("_", "-")
+    first, last, guard = before.figures, after.figures, metrics["guard"]
     lead = (
         f"{metrics['iterations']} iterations of {algorithm} on {reward}, with the pretraining loss on real scenes as "
-        f"regularisation. All numbers are means over {count} fresh, seeded samples of each prior; none was selected."
+        f"regularisation. All numbers are means over {first['scenes']:.0f} fresh, seeded samples of each prior; none "
+        "was selected."
     )
     left_out = metrics.get("left_out", {})
     judged = "left out" if "feasible" in left_out else "physics failed"
     scored = "left out" if "reward" in left_out else "no scene could be scored"
     tiles = [
-        _tile(f"reward: {reward}", "reward", before, after, scored),
-        _tile("objects per scene", "objects", before, after),
-        _tile("feasible as sampled", "feasible_objects", before, after, judged),
-        _tile("simulation-ready", "ready_objects", before, after, judged),
+        _tile(f"reward: {reward}", "reward", first, last, scored),
+        _tile("objects per scene", "objects", first, last),
+        _tile("feasible as sampled", "feasible_objects", first, last, judged),
+        _tile("simulation-ready", "ready_objects", first, last, judged),
         Tile("held-out loss", f"{guard['ratio']:.2f}×", f"of the base prior; limit {guard['limit']:g}×"),
     ]
     over = guard["over_optimised_from"]
@@ -392,8 +365,8 @@ def _page(
         verdict += f" The reward could not score {lost} of the scenes; log.txt says why."
     caption = f"Mean {reward} of each batch, and the guard." + ("" if over is None else " Shaded: over-optimised.")
     sections = [
-        Section("The curve", verdict, [Picture(curve, caption)]),
-        *held,
+        Section("The curve", verdict, [Picture(directory / "curve.png", caption)]),
+        *hold_sections(metrics.get("hold")),
         *guard_sections(guard, pictures),
         Section(
             "As sampled",
@@ -404,8 +377,9 @@ def _page(
             [Picture(pictures[key], key[:-6].title()) for key in ("before_ready", "after_ready") if key in pictures],
             left_out,
         ),
-        Section("Numbers", table=_with_change(before, after)),
+        Section("Numbers", table=_with_change(first, last)),
     ]
+    title = f"Steering {before.raw.scene_type.name.replace('_', ' ')} toward {reward}"
     return Page(title, lead, tiles, sections, settings)
 
 
@@ -442,42 +416,15 @@ def guard_sections(guard: Mapping[str, Any], pictures: Mapping[str, Path]) -> li
             limit = guard["sample_limits"].get(name)
             largest = "none" if limit is None else f"{base[name] + limit:.3g}"
             rows.append((label, *(f"{figures[name]:.3g}" for figures in (base, best, last)), largest))
-    within, beyond = pictures.get("guard_within"), pictures.get("guard_beyond")
-    shown = [Picture(within, "Of the prior kept")] if within else []
-    shown += [Picture(beyond, "Of the first check beyond a limit")] if beyond else []
+    captions = {"guard_within": "Of the prior kept", "guard_beyond": "Of the first check beyond a limit"}
+    shown = [Picture(pictures[name], caption) for name, caption in captions.items() if name in pictures]
     text = "Each check sampled from the same noise, and compared the samples with held-out real scenes."
     return [Section("What the guard sampled", text, shown, table=rows)]
 
 
-def hold_sections(hold: Mapping[str, Any] | None, history: Sequence[Mapping[str, float]], path: Path) -> list[Section]:
-    """A section on the target, with its picture written to ``path``; no section for a run without a target."""
-    if hold is None or hold["measured"] is None:
-        return []
-    caption = "The held-out loss with its target, and the weight of the regularisation over its first value."
-    picture = Picture(_draw(held_ratio(hold["target"]), history, path), caption)
-    return [Section("What was held", hold["verdict"], [picture])]
-
-
-def _draw(target: float, history: Sequence[Mapping[str, float]], path: Path) -> Path:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    measured = [(row["iteration"], row["guard_ratio"]) for row in history if "guard_ratio" in row]
-    weights = [(row["iteration"], row["hold_factor"]) for row in history if "hold_factor" in row]
-    figure = Figure(figsize=(8.4, 4.2), dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    upper.plot(*zip(*measured, strict=True), ".-", color=GUARD_COLOR)
-    upper.axhline(target, color=FAINT, linestyle="--", linewidth=1)
-    upper.set_ylabel("held-out loss over base")
-    lower.semilogy(*zip(*weights, strict=True), color=REWARD_COLOR)
-    lower.set_ylabel("factor on the weight")
-    lower.set_xlabel("iteration")
-    for axes in (upper, lower):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=9)
-    figure.savefig(path)
-    return path
+def hold_sections(hold: Mapping[str, Any] | None) -> list[Section]:
+    """A section that says whether the target was held; none for a run without a target."""
+    return [] if hold is None or hold["measured"] is None else [Section("What was held", hold["verdict"])]
 
 
 def number_rows(columns: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:

@@ -25,7 +25,6 @@ from scene_envs.datasets.prompts import describe_all
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.scoring import grammar_prompts
 from scene_envs.errors import TrainingError
-from scene_envs.files import write_text
 from scene_envs.scene import SceneBatch
 
 STREAMS = {
@@ -53,17 +52,10 @@ def stream_seed(seed: int, stream: str, iteration: int = 0) -> int:
 class SeededPolicy(TensorDictModuleBase):
     """A policy for one batch, whose noise follows from a seed: an episode gets the same, whichever process runs it.
 
-    It reads and writes the keys of ``policy``, but for ``action_log_prob``. All episodes are at the same step. The
-    prompts are encoded once, at the first step.
-
-    Args:
-        policy: policy that draws the actions.
-        seed: seed of the run.
-        iteration: number of the batch in the run, from 0.
-        hook: change of the distributions, as :meth:`DenoisingPolicy.claim_hook` makes it.
-
-    Attributes:
-        text: tokens (B, L, W) and mask (B, L) that the network attends to; None when the prior reads no prompts.
+    It reads and writes the keys of ``policy``, but for ``action_log_prob``. All episodes start at its first call. The
+    prompts are encoded once, at the first step; ``text`` has their tokens (B, L, W) and mask (B, L), None for a prior
+    that reads none. ``seed`` is that of the run, ``iteration`` the number of the batch in it, from 0, and ``hook``
+    changes the distributions as :meth:`DenoisingPolicy.claim_hook` makes it.
     """
 
     def __init__(self, policy: DenoisingPolicy, seed: int, iteration: int = 0, hook: Hook | None = None) -> None:
@@ -71,7 +63,7 @@ class SeededPolicy(TensorDictModuleBase):
         self.in_keys, self.out_keys = policy.in_keys, ["action", "slot_log_prob"]
         self.policy, self.hook, self.iteration = policy, hook, iteration
         self.text: Text | None = None
-        self._seed = stream_seed(seed, "noise", iteration)
+        self._seed, self._step = stream_seed(seed, "noise", iteration), 0
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write an action and its log-probability.
@@ -80,7 +72,7 @@ class SeededPolicy(TensorDictModuleBase):
             TrainingError: the prior gave values that are not finite.
         """
         scene, processes = tensordict["scene"], ProcessGroup.current()
-        step = self.policy.step_of(int(tensordict["timestep"][0]))
+        step, self._step = self._step, self._step + 1
         if step == 0:
             self._generator = Generator(scene.device).manual_seed(self._seed)
             self.text = self.policy.read(tensordict["prompt"]) if "prompt" in self.in_keys else None
@@ -129,6 +121,8 @@ def collect(
         prompts: one prompt per row; None lets the environment draw them.
     """
     core, rank = env.core, ProcessGroup.current().rank
+    for timestep in core.table.timesteps.tolist():
+        policy.step_of(timestep)  # raises where environment and policy have other steps
     env.set_seed(stream_seed(seed, "start", iteration) + rank * core.num_envs)
     seeded = SeededPolicy(policy, seed, iteration, policy.claim_hook(prompts, core.slots))
     start = env.reset(prompts=prompts)
@@ -148,7 +142,7 @@ def _verdict(env: DenoisingTorchRLEnv) -> dict[str | tuple[str, str], Tensor]:
     assert result.batch is not None
     assert result.score is not None
     scenes, score, scorer = result.batch, result.score, env.core.scorer
-    judged = score.object_flags.get("judged", scenes.is_free).to(device)
+    judged = score.object_flags.get("judged", scenes.is_free)
     credited = judged.clone() if scorer.averages_objects else torch.ones_like(judged)
     credited[:, : len(scenes.scene_type.fixed)] = False  # fixed slots are not drawn
     entries: dict[str | tuple[str, str], Tensor] = {
@@ -167,8 +161,8 @@ def _verdict(env: DenoisingTorchRLEnv) -> dict[str | tuple[str, str], Tensor]:
 
 
 def finished_scenes(batch: TensorDictBase) -> SceneBatch:
-    """The finished scenes of a batch, on the CPU."""
-    return SceneBatch(batch["finished"][:, -1].cpu(), batch["scene_type"])
+    """The finished scenes of a batch, on its device."""
+    return SceneBatch(batch["finished"][:, -1], batch["scene_type"])
 
 
 def text_of(states: TensorDictBase) -> Text | None:
@@ -178,8 +172,8 @@ def text_of(states: TensorDictBase) -> Text | None:
 
 
 def gathered_scenes(batch: TensorDictBase) -> SceneBatch:
-    """The finished scenes of all processes."""
-    scenes = finished_scenes(batch)
+    """The finished scenes of all processes, on the CPU."""
+    scenes = finished_scenes(batch).to("cpu")
     return SceneBatch(gather_rows(scenes.tensor), scenes.scene_type)
 
 
@@ -233,15 +227,11 @@ class PromptDeck:
 
     def deal(self, count: int, generator: Generator) -> list[str]:
         """``count`` prompts; neighbours share a prompt, in groups of ``share`` or a few more."""
-        groups = max(1, count // self.share)
-        different = [self._text(index, generator) for index in self._indices(groups, generator)]
-        return [different[row * groups // count] for row in range(count)]
-
-    def _indices(self, groups: int, generator: Generator) -> list[int]:
-        """Indices of prompts, without repetition while there are enough."""
-        size = len(self._texts) or self._count
+        groups, size = max(1, count // self.share), len(self._texts) or self._count
         rounds = [torch.randperm(size, generator=generator) for _ in range(-(-groups // size))]
-        return torch.cat(rounds)[:groups].tolist()  # type: ignore[no-any-return]
+        indices = torch.cat(rounds)[:groups].tolist()  # without repetition while there are enough
+        different = [self._text(index, generator) for index in indices]
+        return [different[row * groups // count] for row in range(count)]
 
     def _text(self, index: int, generator: Generator) -> str:
         if self._texts or self._real is None:
@@ -265,8 +255,3 @@ def run_prompts(directory: Path, batch: SceneBatch, seed: int) -> PromptSets:
         return texts
 
     return described
-
-
-def save_prompts(path: Path, prompts: Sequence[Sequence[str]]) -> None:
-    """Write the prompts of a dataset's scenes to ``path``, as JSON."""
-    write_text(path, json.dumps([list(texts) for texts in prompts]) + "\n")

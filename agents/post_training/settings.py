@@ -224,27 +224,22 @@ ENTRY_POINT_GROUP = "scene_envs.algorithms"
 AlgorithmClass = TypeVar("AlgorithmClass", bound=type)
 
 
-@dataclass(frozen=True)
-class _Entry:
-    settings: type[AlgorithmSettings]
-    code: Any
-    """The class, or its ``module:class``, which is imported when it is needed."""
-
-
-_FORWARD = "agents.post_training.algorithms.forward_process:ForwardProcess"
-_ALGORITHMS = Registry(
+_FOLDER = "agents.post_training.algorithms"
+_ALGORITHMS: Registry[tuple[type[AlgorithmSettings], Any]] = Registry(
     "algorithm",
     ENTRY_POINT_GROUP,
     {
-        "ddpo_sf": _Entry(DDPOSFSettings, "agents.post_training.algorithms.ddpo:DDPO"),
-        "ddpo_is": _Entry(DDPOISSettings, "agents.post_training.algorithms.ddpo:DDPO"),
-        "guidance_distillation": _Entry(
-            GuidanceDistillationSettings, "agents.post_training.algorithms.guidance_distillation:GuidanceDistillation"
+        "ddpo_sf": (DDPOSFSettings, f"{_FOLDER}.ddpo:DDPO"),
+        "ddpo_is": (DDPOISSettings, f"{_FOLDER}.ddpo:DDPO"),
+        "guidance_distillation": (
+            GuidanceDistillationSettings,
+            f"{_FOLDER}.guidance_distillation:GuidanceDistillation",
         ),
-        "nft": _Entry(NFTSettings, _FORWARD),
-        "awm": _Entry(AWMSettings, _FORWARD),
+        "nft": (NFTSettings, f"{_FOLDER}.forward_process:ForwardProcess"),
+        "awm": (AWMSettings, f"{_FOLDER}.forward_process:ForwardProcess"),
     },
 )
+"""Settings and class of each algorithm; a class as ``module:class`` is imported when it is needed."""
 
 
 def register_algorithm(
@@ -255,15 +250,11 @@ def register_algorithm(
     The decorated class takes ``(settings, policy, stds)`` and extends :class:`agents.post_training.Algorithm` or one
     of its subclasses, such as :class:`agents.post_training.DDPO`.
 
-    Args:
-        name: name of letters, digits and underscores.
-        settings: dataclass of the algorithm's keys, with a sentence for each under ``Attributes:``.
-
-    Raises:
-        InvalidInputError: the name is not one word.
+    ``settings`` is the dataclass of the algorithm's keys, with a sentence for each under ``Attributes:``. An
+    InvalidInputError if the name is not one word of letters, digits and underscores.
     """
     _ALGORITHMS.check_name(name, "my_ddpo")
-    return _ALGORITHMS.adding(name, lambda algorithm: _Entry(settings, algorithm))
+    return _ALGORITHMS.adding(name, lambda algorithm: (settings, algorithm))
 
 
 def list_algorithms() -> list[str]:
@@ -273,12 +264,12 @@ def list_algorithms() -> list[str]:
 
 def algorithm_settings(name: str) -> type[AlgorithmSettings]:
     """The dataclass of an algorithm's keys; an UnknownNameError offers the nearest known name."""
-    return _ALGORITHMS[name].settings
+    return _ALGORITHMS[name][0]
 
 
 def make_algorithm(settings: AlgorithmSettings, policy: Any, stds: Any) -> Any:
     """The algorithm of these settings for a policy, whose steps have the standard deviations ``stds`` (S,)."""
-    code = _ALGORITHMS[settings.name].code
+    code = _ALGORITHMS[settings.name][1]
     if isinstance(code, str):
         module, _, attribute = code.partition(":")
         code = getattr(import_module(module), attribute)
@@ -346,11 +337,6 @@ class RegularisationSettings:
     def target(self) -> float | None:
         """Ratio of the held-out loss to the base prior's that ``hold`` names."""
         return None if self.hold is None else held_ratio(self.hold)
-
-    @property
-    def pretraining_weight(self) -> float:
-        """``weight``, or 0 for null; the config of a run has replaced null by the default of the algorithm."""
-        return self.weight or 0.0
 
 
 RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "progress", "reward_limits")

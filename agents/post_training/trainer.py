@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -36,10 +37,12 @@ from agents.post_training.settings import PostTrainConfig
 from agents.priors.prior import ScenePrior, check_object_count, no_text
 from agents.utils.checkpoints import check_tensors, save_checkpoint
 from agents.utils.interrupts import finishing_steps
-from agents.utils.loggers import make_logger
+from agents.utils.loggers import RunLogger
 from agents.utils.process_group import ProcessGroup, launched_processes
-from agents.utils.weight_average import AveragedWeights
+from agents.utils.weight_average import averaged_weights
 from rewards import reward_label
+from scene_envs.arrays import resolve_device
+from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed
 from scene_envs.scene import SceneBatch
@@ -54,6 +57,8 @@ _PROBED_WITH_PROMPTS = 8
 """The same number in a run that uses the prompts of its real scenes."""
 _PICTURED = 6
 """Number of the guard's samples that are kept for the report."""
+_STATE = ("iteration", "invalid_streak", "rollbacks", "seconds", "history")
+"""Attributes of a trainer that are kept in a checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +66,7 @@ class PostTrainResult:
     """Result of a finished run.
 
     Attributes:
-        prior: best prior within the guard's limit, also in ``directory / "prior"``.
+        prior: best prior within the guard's limit, on the device of the run; also in ``directory / "prior"``.
         history: one row of the log per iteration.
         metrics: contents of ``metrics.json``.
         directory: folder of the run.
@@ -102,33 +107,21 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     >>> len(result.history), result.history[0]["log_ratio"]
     (2, 0.0)
     """
-    _check_shares(config.batch_size, launched_processes())
-    processes = ProcessGroup.join(config.device)
-    with claimed(config.directory, "post_train") if processes.is_first else nullcontext():
-        trainer = PostTrainer(config, prior=prior)
-        try:
-            return trainer.run()
-        finally:
-            trainer.close()
-
-
-def _check_shares(batch_size: int, processes: int) -> None:
-    if batch_size % processes:
-        lower = batch_size // processes * processes
-        nearest = f"{lower} or {lower + processes}" if lower else str(processes)
+    if config.batch_size % (count := launched_processes()):
+        lower = config.batch_size // count * count
+        nearest = f"{lower} or {lower + count}" if lower else str(count)
         raise InvalidInputError(
-            f"batch_size={batch_size} is not a multiple of {processes}, the number of processes; give "
+            f"batch_size={config.batch_size} is not a multiple of {count}, the number of processes; give "
             f"batch_size={nearest}, or another number of processes"
         )
+    processes = ProcessGroup.join(str(resolve_device(config.device, None if prior is None else prior.device)))
+    claim = claimed(config.directory, "post_train") if processes.is_first else nullcontext()
+    with claim, closing(PostTrainer(config, prior=prior)) as trainer:
+        return trainer.run()
 
 
 class PostTrainer:
-    """One run: its loop, its guard and its files.
-
-    Args:
-        config: configuration of the run.
-        prior: prior to start from, instead of the one that ``config.prior`` names.
-    """
+    """One run: its loop, its guard and its files; ``prior`` is that to start from, None the one of ``config.prior``."""
 
     guard: Guard
     scenes: SceneBank
@@ -137,11 +130,13 @@ class PostTrainer:
         self.config, self.plain = config, config.plain()
         self.directory = config.directory
         self.processes = ProcessGroup.current()
-        base = ScenePrior.load(config.prior if prior is None else prior)
+        base = cast(ScenePrior, resolve_prior(config.prior if prior is None else prior, config.device))
+        self.device = base.device
         if config.prompt is not None and not base.conditional:
             raise no_text(base.scene_type, str(config.prompt))
+        self._base: ScenePrior | None = base  # until the guard has measured it
         self.base_name = short_name(base.loaded_as) if base.loaded_as else ""
-        self.prior = deepcopy(base).to(config.device).eval()
+        self.prior = deepcopy(base).eval()
         policy = DenoisingPolicy(
             self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,
             claim_guidance=config.claim_guidance,
@@ -149,15 +144,12 @@ class PostTrainer:
         self.learner = Learner(
             policy, config.resolved_reward(), config.algorithm, config.optimizer, config.regularisation,
             batch_size=config.batch_size, slots=config.slots, prompt=config.prompt, workers=config.workers,
-            physics=config.physics,
-            seed=config.seed,
+            physics=config.physics, seed=config.seed,
         )  # fmt: skip
-        self.iteration = 0
-        self.invalid_streak = 0
-        self.rollbacks = 0
+        self.iteration = self.invalid_streak = self.rollbacks = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
-        self.logger = make_logger(config.logger.name if self.processes.is_first else "csv", self.directory)
+        self.logger = RunLogger(config.logger.name if self.processes.is_first else "csv", self.directory)
 
     def close(self) -> None:
         """Stop physics workers, if any, and close the logger."""
@@ -176,7 +168,8 @@ class PostTrainer:
         else:
             if self.processes.is_first:
                 write_text(self.directory / "config.yaml", sealed(config_text(self.plain)))
-            self.guard.start(self.prior)
+            if self.learner.learned:  # a reward that learns is another one later
+                self._start_guard()
             self._keep(self.prior)  # the best prior so far is the base
         title = f"post-train {self.prior.scene_type.name}"
         started = time.perf_counter() - self.seconds
@@ -221,7 +214,7 @@ class PostTrainer:
             if config.prompt == "data":
                 large = torch.nonzero(batch.counts > slots)[:, 0].tolist()
                 check_object_count([text for i in large for text in prompts(i)], self.prior.scene_type, slots)
-        x0 = self.prior.encode(batch.to(config.device))
+        x0 = self.prior.encode(batch.to(self.device))
         self.scenes = SceneBank.split(x0, config.guard.scenes, prompts)
         self.learner.deal_prompts(self.scenes)
         self.learner.begin_rewards(batch[: len(self.scenes.train)], first=not reuse_scenes)
@@ -281,7 +274,7 @@ class PostTrainer:
             scenes.heldout,
             config.guard.limit,
             stream_seed(config.seed, "guard"),
-            scenes.heldout_prompts(),
+            scenes.heldout_prompts,
             check,
             config.guard.sample_limits(config.algorithm.sample_limits),
             math.inf if target is None else target,
@@ -290,13 +283,19 @@ class PostTrainer:
 
     def step(self) -> tuple[TensorDict, dict[str, float]]:
         """One iteration: a batch of fresh scenes and its updates. Returns the batch and the row for the log."""
-        batch = self.learner.rollout(self.iteration)
+        batch = self.learner.in_memory(lambda: self.learner.rollout(self.iteration))
         row = {"iteration": float(self.iteration + 1), **reward_figures(batch)}
         if row["valid_fraction"] > 0:
             self.invalid_streak = 0
             row |= self._learn(batch)
+        elif self.iteration == 0:
+            raise self._nothing_scored("no scene of the first batch")
         else:
-            self._count_invalid()
+            self.invalid_streak += 1
+            if self.invalid_streak >= MAX_INVALID:
+                raise self._nothing_scored(
+                    f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}"
+                )
         self.learner.learn_rewards(batch)
         self.iteration += 1
         return batch, row
@@ -308,7 +307,7 @@ class PostTrainer:
         for update in range(updates):
             index = self.iteration * updates + update
             try:
-                row = self.learner.update(batch, self.scenes, index)
+                row = self.learner.in_memory(partial(self.learner.update, batch, self.scenes, index))
             except NonFiniteGradient as error:
                 raise self._not_finite(error.figures) from None
         self.learner.algorithm.end_iteration()
@@ -322,12 +321,19 @@ class PostTrainer:
             return self.rollbacks > _MAX_ROLLBACKS
         return self.config.guard.action == "stop" and self.guard.over_limit_at is not None
 
+    def _start_guard(self) -> None:
+        """Measure the base prior, with which later checks are compared; done before the first of them."""
+        if self._base is not None and math.isnan(self.guard.base_loss):
+            self.guard.start(deepcopy(self._base).eval())
+        self._base = None
+
     def _check(self, batch: TensorDict, *, sample: bool) -> None:
+        self._start_guard()
         since = self.guard.readings[-1].iteration if self.guard.readings else 0
         recent = [row["reward"] for row in self.history[since:] if math.isfinite(row["reward"])]
         reward = sum(recent) / len(recent) if recent else float("nan")
         scenes = gathered_scenes(batch)
-        with AveragedWeights(self.prior, self.learner.algorithm.average) as prior:
+        with averaged_weights(self.prior, self.learner.algorithm.average) as prior:
             reading = self.guard.check(prior, self.iteration, reward, realism(scenes), sample=sample)
             if reading.kept:
                 self._keep(prior)
@@ -339,15 +345,6 @@ class PostTrainer:
             self.rollbacks += 1
             self.learner.return_to(self._best())
             self.learner.regularisation.return_to_checkpoint(self.guard.best_ratio)
-
-    def _count_invalid(self) -> None:
-        self.invalid_streak += 1
-        if self.iteration == 0:
-            raise self._nothing_scored("no scene of the first batch")
-        if self.invalid_streak >= MAX_INVALID:
-            raise self._nothing_scored(
-                f"no scene in {self.invalid_streak} batches in a row, the last at iteration {self.iteration + 1}"
-            )
 
     def _nothing_scored(self, what: str) -> TrainingError:
         return TrainingError(
@@ -404,11 +401,7 @@ class PostTrainer:
             return
         state = {
             "config": self.plain,
-            "iteration": self.iteration,
-            "invalid_streak": self.invalid_streak,
-            "rollbacks": self.rollbacks,
-            "seconds": self.seconds,
-            "history": self.history,
+            **{name: getattr(self, name) for name in _STATE},
             "guard": self.guard.state(),
             "learner": self.learner.state(),
         }
@@ -419,9 +412,8 @@ class PostTrainer:
             write_log(self.directory, self.history)
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self.iteration, self.invalid_streak = state["iteration"], state["invalid_streak"]
-        self.rollbacks = state["rollbacks"]
-        self.seconds, self.history = state["seconds"], list(state["history"])
+        for name in _STATE:
+            setattr(self, name, state[name])
         self.guard.restore(state["guard"])
         check_tensors(self.prior, state["learner"]["prior"], self.directory / CHECKPOINT_NAME)
         self.learner.restore(state["learner"])
@@ -451,4 +443,4 @@ class PostTrainer:
                 beyond=self.guard.over_limit_at,
                 highest=self.learner.largest_reward(),
             )
-        return PostTrainResult(self._best(), self.history, metrics, self.directory, self.config)
+        return PostTrainResult(self._best().to(self.device), self.history, metrics, self.directory, self.config)

@@ -124,7 +124,7 @@ def _prepare_union(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Te
         )
     whole = [SceneDataset.load(folder.strip()) for folder in config.data.split(",")]
     union = register_scene_type(union_scene_type([dataset.scene_type for dataset in whole]))
-    parts = [dataset.stable_split((0.98, 0.02), seed=0) for dataset in whole]
+    parts = [dataset.split((0.98, 0.02), seed=0) for dataset in whole]
     share = slice(min(5000, FITTED_ON // len(whole)))  # moments see scenes of every type
     some = torch.cat([to_union(dataset.batch(share), union).tensor for dataset, _ in parts])
     normalizer = union_normalizer([dataset.normalizer for dataset in whole], union)
@@ -299,7 +299,6 @@ def _conditions_counts(config: PretrainConfig) -> bool:
         config.text.vocabulary.count_conditioning
         and config.network.name == "flux"
         and config.text.encoder == VOCABULARY
-        and config.text.vocabulary.latents > 0
     )
 
 
@@ -346,11 +345,7 @@ class SceneTable:
     def __init__(self, scenes: Tensor, prompts: Sequence[Sequence[str]] = ()) -> None:
         self.scenes = scenes
         self.prompts = prompts
-
-    @property
-    def size(self) -> int:
-        """Number of scenes, M."""
-        return len(self.scenes)
+        self.size = len(scenes)
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:
         """See :class:`TrainingData`."""
@@ -364,11 +359,7 @@ class UnionTable:
     def __init__(self, datasets: Sequence[SceneDataset], prior: ScenePrior) -> None:
         self.datasets = datasets
         self.prior = prior
-
-    @property
-    def size(self) -> int:
-        """Number of scenes of all types."""
-        return sum(len(dataset) for dataset in self.datasets)
+        self.size = sum(map(len, datasets))
 
     def draw(self, count: int, generator: Generator, *, prompts: bool) -> tuple[Tensor, list[Sequence[str]]]:
         """See :class:`TrainingData`."""

@@ -8,15 +8,11 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.adamw import adamw
 
-from agents.pretraining.settings import PretrainConfig
+from agents.pretraining.settings import PretrainConfig, PretrainOptimizerSettings
 from scene_envs.errors import unknown_name
 
-OPTIMIZERS = ("adamw", "muon")
-"""Optimisers that :func:`build_optimizer` builds."""
-
-_BETAS, _EPS = (0.9, 0.99), 1e-8
+_BETAS = (0.9, 0.99)
 _MOMENTUM = 0.95
 _COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 """Coefficients of the quintic Newton-Schulz iteration (Jordan et al. 2024)."""
@@ -41,8 +37,8 @@ def build_optimizer(
     percent of the loss depend on prompts at first, and at the full rate all words get the same embedding before they
     are read.
     """
-    if name not in OPTIMIZERS:
-        raise unknown_name("optimizer", name, OPTIMIZERS)
+    if name not in PretrainOptimizerSettings.KNOWN:
+        raise unknown_name("optimizer", name, PretrainOptimizerSettings.KNOWN)
     named = [(key, parameter) for key, parameter in network.named_parameters() if parameter.requires_grad]
     text = [p for key, p in named if key.startswith("text_encoder.")]
     matrices = [p for key, p in named if p.ndim == 2 and "blocks." in key and name == "muon"]
@@ -60,7 +56,7 @@ def build_optimizer(
     return optimizer
 
 
-class MuonAdamW(torch.optim.Optimizer):
+class MuonAdamW(torch.optim.AdamW):
     """Muon (Jordan et al. 2024) on matrices and AdamW on everything else, under one learning rate, with decoupled
     weight decay. A matrix's update is its momentum made orthogonal, scaled to the root mean square of an AdamW update
     (Liu et al. 2025), in float32, because ``torch.optim.Muon`` iterates in bfloat16, which is very slow on most CPUs.
@@ -77,49 +73,29 @@ class MuonAdamW(torch.optim.Optimizer):
         self, matrices: list[nn.Parameter], others: list[nn.Parameter], lr: float = 1e-3, weight_decay: float = 0.01
     ) -> None:
         groups = [{"params": matrices, "kind": "muon"}, {"params": others, "kind": "adamw"}]
-        super().__init__([group for group in groups if group["params"]], {"lr": lr, "weight_decay": weight_decay})
+        used = [group for group in groups if group["params"]]
+        super().__init__(used, lr, _BETAS, weight_decay=weight_decay, foreach=False)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
-        """One update of every parameter that has a gradient; a closure is not supported."""
+        """One update of every parameter that has a gradient; the gradients of matrices are None then. A closure is not
+        supported.
+        """
         for group in self.param_groups:
-            parameters = [p for p in group["params"] if p.grad is not None]
-            if group["kind"] == "adamw":
-                self._step_adamw(parameters, group["lr"], group["weight_decay"])
-                continue
-            for parameter in parameters:
-                parameter.mul_(1.0 - group["lr"] * group["weight_decay"])
-                parameter.add_(self._muon(parameter.grad, self.state[parameter]), alpha=-group["lr"])
+            for parameter in group["params"] if group["kind"] == "muon" else ():
+                if parameter.grad is not None:
+                    parameter.mul_(1.0 - group["lr"] * group["weight_decay"])
+                    parameter.add_(self._muon(parameter.grad, self.state[parameter]), alpha=-group["lr"])
+                    parameter.grad = None  # AdamW leaves such parameters as they are
+        super().step()
 
     @staticmethod
     def _muon(gradient: Tensor, state: dict[str, Any]) -> Tensor:
+        state.setdefault("step", torch.zeros(()))  # AdamW looks for it in every state that it loads
         momentum = state.setdefault("momentum", torch.zeros_like(gradient))
         momentum.lerp_(gradient, 1.0 - _MOMENTUM)
         direction = orthogonalised(gradient.lerp(momentum, _MOMENTUM))
         return 0.2 * math.sqrt(max(gradient.shape)) * direction
-
-    def _step_adamw(self, parameters: list[Tensor], lr: float, weight_decay: float) -> None:
-        states = [self.state[p] for p in parameters]
-        for parameter, state in zip(parameters, states, strict=True):
-            if not state:
-                state |= {"step": 0, "mean": torch.zeros_like(parameter), "square": torch.zeros_like(parameter)}
-            state["step"] = torch.as_tensor(float(state["step"]))
-        adamw(
-            parameters,
-            [p.grad for p in parameters if p.grad is not None],
-            [state["mean"] for state in states],
-            [state["square"] for state in states],
-            max_exp_avg_sqs=[],
-            state_steps=[state["step"] for state in states],
-            foreach=False,
-            amsgrad=False,
-            beta1=_BETAS[0],
-            beta2=_BETAS[1],
-            lr=lr,
-            weight_decay=weight_decay,
-            eps=_EPS,
-            maximize=False,
-        )
 
 
 def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:

@@ -254,12 +254,12 @@ class VocabularySettings:
     Attributes:
         width: width.
         depth: number of blocks.
-        latents: number of tokens to which a prompt is condensed; 0 for one token per word.
+        latents: number of tokens to which a prompt is condensed.
         window: number of neighbouring words that are combined before attention, odd; 1 reads each
             word alone.
         lr_share: learning rate, as a fraction of optimizer.lr.
         count_conditioning: it predicts how many objects of each kind the prompt asks for; these
-            numbers, less the visible objects, are added to the logits of the mixed flux network; needs latents.
+            numbers, less the visible objects, are added to the logits of the mixed flux network.
         warmup: steps in which only the text encoder is trained, to predict the numbers of its prompts, before the first
             step of a fresh prior; at most iterations.
         numbers: embeddings of number words contain their value, so that counts need not be
@@ -276,8 +276,8 @@ class VocabularySettings:
     numbers: bool = True
 
     def __post_init__(self) -> None:
-        require_at_least(self, 1, "width", "depth", "window")
-        require_at_least(self, 0, "latents", "lr_share", "warmup")
+        require_at_least(self, 1, "width", "depth", "latents", "window")
+        require_at_least(self, 0, "lr_share", "warmup")
 
 
 @dataclass
@@ -381,18 +381,15 @@ class PretrainLoggerSettings(LoggerSettings):
     Attributes:
         log_every: steps between rows of log.csv.
         evaluate_every: steps between evaluations on held-out scenes.
-        pictures_every: steps between pictures of samples; 0 draws none.
     """
 
     checkpoint_every: int = 250
     log_every: int = 20
     evaluate_every: int = 250
-    pictures_every: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_at_least(self, 1, "log_every", "evaluate_every")
-        require_at_least(self, 0, "pictures_every")
 
 
 @dataclass

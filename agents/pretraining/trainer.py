@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import csv
-import io
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,9 +24,10 @@ from agents.pretraining.settings import WEIGHT_DECAY, PretrainConfig
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import check_tensors, derived_generator, load_checkpoint, save_checkpoint
 from agents.utils.interrupts import Ending, finishing_steps
-from agents.utils.loggers import RunLogger, make_logger
+from agents.utils.loggers import RunLogger
 from agents.utils.process_group import ProcessGroup, is_first_process
-from agents.utils.weight_average import AveragedWeights, WeightAverage
+from agents.utils.weight_average import WeightAverage, averaged_weights
+from scene_envs.arrays import resolve_device, within_memory
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.files import claimed, sealed, write_json, write_text
 from scene_envs.progress import Progress
@@ -40,6 +39,8 @@ FIELDS = ("step", "loss", "heldout", "gradient_norm", "learning_rate", "seconds"
 """Columns of ``log.csv``."""
 _MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe", "progress")
 """Keys that may change between a run and its continuation."""
+_CHUNK = 256
+"""Number of held-out scenes per pass."""
 _RESIDUAL = 512
 """Number of held-out scenes on which the residual error of the denoiser is measured."""
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -47,61 +48,16 @@ _RATE, _RISE = 3e-3, 0.2
 """Peak learning rate of the text warm-up, and the share of its steps in which it rises."""
 
 
-class TrainingLog:
-    """The file ``log.csv`` in ``directory``, each row written at once; the logger ``also`` gets the same rows."""
-
-    def __init__(self, directory: Path, also: RunLogger | None = None) -> None:
-        self.directory = directory
-        self.also = RunLogger() if also is None else also
-
-    def begin(self, step: int) -> None:
-        """Keep each row up to ``step`` once; remove rows beyond a checkpoint and, with ``step`` 0, of another run."""
-        path = self.directory / "log.csv"
-        if not path.exists():
-            return
-        with path.open(newline="", encoding="utf-8", errors="replace") as file:
-            rows = list(csv.DictReader(file))
-        # the last row of a killed run may lack some numbers
-        whole = [row for row in rows if str(row.get("step") or "").isdigit() and None not in map(row.get, FIELDS)]
-        kept = {int(row["step"]): row for row in whole if int(row["step"]) <= step}
-        if not kept:
-            path.unlink()
-            return
-        text = io.StringIO()
-        writer = csv.DictWriter(text, FIELDS, extrasaction="ignore")
-        writer.writeheader()
-        writer.writerows(kept[number] for number in sorted(kept))
-        write_text(path, text.getvalue())
-
-    def write(self, row: dict[str, float]) -> None:
-        """Write one row."""
-        logger.debug("%s", "  ".join(f"{key} {value:.6g}" for key, value in row.items()))
-        path = self.directory / "log.csv"
-        fresh = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, FIELDS)
-            if fresh:
-                writer.writeheader()
-            writer.writerow(row)
-        self.also.log({key: value for key, value in row.items() if key != "step"}, int(row["step"]))
-
-
-def draw_samples(prior: ScenePrior, directory: Path, step: int, seed: int) -> None:
-    """Draw a gallery of samples of a prior, ``samples-STEP.png`` in ``directory``."""
-    from scene_envs.render import gallery, render
-
-    batch = prior.sample(8, num_steps=50, seed=seed).to("cpu")
-    captions = [f"{int(count)} objects" for count in batch.counts]
-    gallery(list(render(batch, width=400, height=300)), columns=4, captions=captions).save(
-        directory / f"samples-{step:07d}.png"
-    )
-
-
 @torch.no_grad()
-def heldout_loss(prior: ScenePrior, x0: Tensor, seed: int = 1234, batch_size: int = 256) -> float:
-    """Pretraining loss on normalised scenes ``x0`` with timesteps and noise fixed by ``seed``."""
-    generator = Generator().manual_seed(seed)
-    losses = [prior.pretraining_loss(chunk, generator, "none") for chunk in x0.split(batch_size)]
+def heldout_loss(prior: ScenePrior, x0: Tensor, prompts: Sequence[str] | None = None, seed: int = 1234) -> float:
+    """Pretraining loss on normalised scenes ``x0`` (K, N, D), of ``prompts`` if given; ``seed`` fixes timesteps and
+    noise.
+    """
+    generator, losses = Generator().manual_seed(seed), []
+    for start in range(0, len(x0), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        text = None if prompts is None else prior.encode_prompts(prompts[rows])
+        losses.append(prior.pretraining_loss(x0[rows], generator, "none", text=text))
     return float(torch.cat(losses).mean())
 
 
@@ -121,14 +77,15 @@ class Pretrainer:
     def __init__(self, config: PretrainConfig, data: TrainingData, heldout: Tensor, prior: ScenePrior) -> None:
         self.config = config
         self.data, self.heldout_data = data, heldout
-        self.processes = ProcessGroup.join(config.device)
+        self.device = resolve_device(config.device)
+        self.processes = ProcessGroup.join(str(self.device))
         self.parts = self.processes.size * config.optimizer.compute.accumulate
         if config.batch_size % self.parts:
             raise InvalidInputError(
                 f"batch_size={config.batch_size} is not a multiple of {self.parts}, "
                 f"the {self.processes.size} process(es) times accumulate={config.optimizer.compute.accumulate}"
             )
-        self.prior = prior.to(config.device).train()
+        self.prior = prior.to(self.device).train()
         self.network: nn.Module = prior.denoiser
         settings = config.optimizer
         prior.denoiser.precision = _PRECISIONS[settings.compute.precision]
@@ -139,15 +96,16 @@ class Pretrainer:
         self.schedule = self._schedule()
         self.seconds = 0.0
         self.directory = config.directory
+        self.checkpoint_path = self.directory / "checkpoint.pt"
         chosen = config.logger.name if self.processes.is_first else "csv"
-        self.log = TrainingLog(self.directory, make_logger(chosen, self.directory))
-        self.evaluations: list[dict[str, float]] = []
+        self.logger = RunLogger(chosen, self.directory)
+        self.history: list[dict[str, float]] = []  # the rows of log.csv
         self._origin = _origin(config.prior, prior.card)
 
     @property
-    def checkpoint_path(self) -> Path:
-        """File of the resumable state."""
-        return self.directory / "checkpoint.pt"
+    def evaluations(self) -> list[dict[str, float]]:
+        """Losses on held-out scenes, each with its step."""
+        return [{"step": row["step"], "heldout": row["heldout"]} for row in self.history if "heldout" in row]
 
     def run(self) -> ScenePrior:
         """Train to ``config.iterations`` and return the averaged prior; writes it to ``output/prior``."""
@@ -159,19 +117,25 @@ class Pretrainer:
         if self.config.optimizer.compute.compile:
             self.prior.denoiser.network.compile()
         if self.processes.is_first:
-            self.log.begin(self.step)
-        with finishing_steps() as end, self._progress() as progress:
+            (self.directory / "log.csv").unlink(missing_ok=True)  # it may hold rows beyond the checkpoint
+            if self.history:
+                self._write_rows(self.history)
+        shown = self.config.progress if self.processes.is_first else "none"
+        bar = Progress("pretraining", self.config.iterations, done=self.step, style=shown)
+        with finishing_steps() as end, bar as progress:
             for row in self._steps(end):
                 if self.processes.is_first:
                     self._show(progress, row)
-                    self.log.write(row)
-        self.log.also.close()
+                    self._write_rows([row])
+                    logger.debug("%s", "  ".join(f"{key} {value:.6g}" for key, value in row.items()))
+                    self.logger.log({key: value for key, value in row.items() if key != "step"}, self.step)
+        self.logger.close()
         if self.processes.is_first:
             logger.info("measuring the residual error at 40 noise levels, for the samplers")
         with self._averaged():
             count = len(self.heldout_data)  # scenes of a union are sorted by type
             rows = torch.linspace(0, count - 1, min(_RESIDUAL, count)).long()
-            self.prior.fit_residual(self.heldout_data[rows].to(self.config.device))
+            self.prior.fit_residual(self.heldout_data[rows].to(self.device))
         self.prior.denoiser.precision = torch.float32
         return self.save_prior()
 
@@ -182,16 +146,18 @@ class Pretrainer:
             self.processes.share(self.network.parameters())
             self.average = WeightAverage(self.network, self.config.optimizer.ema)
 
-    def _progress(self) -> Progress:
-        style = self.config.progress if self.processes.is_first else "none"
-        return Progress("pretraining", self.config.iterations, done=self.step, style=style)
-
     def _show(self, progress: Progress, row: Mapping[str, float]) -> None:
         step, total = int(row["step"]), self.config.iterations
         heldout = f"  held-out {self.evaluations[-1]['heldout']:.4g}" if self.evaluations else ""
         text = f"loss {row['loss']:.4g}{heldout}"
         left = row["seconds"] / max(1, step) * (total - step)
         progress.update(step, text, f"pretraining {step}/{total}  {text}  {left:.0f} s left")
+
+    def _write_rows(self, rows: Sequence[Mapping[str, float]]) -> None:
+        path = self.directory / "log.csv"
+        header = [] if path.exists() else [{name: name for name in FIELDS}]
+        with path.open("a", newline="") as file:
+            csv.DictWriter(file, FIELDS).writerows([*header, *rows])
 
     def _steps(self, end: Ending) -> Iterator[dict[str, float]]:
         started, config = time.perf_counter() - self.seconds, self.config
@@ -205,18 +171,13 @@ class Pretrainer:
             row: dict[str, float] = {}
             if self.step % config.logger.evaluate_every == 0 or last:
                 with self._averaged():
-                    row["heldout"] = heldout_loss(self.prior, self.heldout_data.to(config.device))
-                self.evaluations.append({"step": self.step, "heldout": row["heldout"]})
+                    row["heldout"] = heldout_loss(self.prior, self.heldout_data.to(self.device))
             if self.step % config.logger.log_every == 0 or row:
                 row |= {"step": self.step, "loss": sum(running) / len(running), "gradient_norm": norm}
                 row |= {"learning_rate": learning_rate_at(self.step - 1, config), "seconds": round(self.seconds, 1)}
                 running.clear()
+                self.history.append(row)
                 yield row
-            pictures = config.logger.pictures_every
-            if pictures and self.step % pictures == 0 and self.processes.is_first:
-                with self._averaged():
-                    draw_samples(self.prior.eval(), self.directory, self.step, config.seed)
-                self.prior.train()
             ending = self.processes.any(end.pending)
             if self.step % config.logger.checkpoint_every == 0 or last or ending:
                 self._save()
@@ -224,14 +185,18 @@ class Pretrainer:
 
     def _update(self) -> tuple[float, float]:
         config = self.config
-        total = torch.zeros((), device=config.device)
+        total = torch.zeros((), device=self.device)
         for part in range(config.optimizer.compute.accumulate):
             generator = derived_generator(
                 config.seed, self.step, self.processes.rank * config.optimizer.compute.accumulate + part
             )
-            loss = self._part_loss(config.batch_size // self.parts, generator) / self.parts
-            loss.backward()  # type: ignore[no-untyped-call]
-            total += loss.detach()
+
+            def part_loss(count: int, generator: Generator = generator) -> Tensor:
+                loss = self._part_loss(count, generator) / self.parts
+                loss.backward()  # type: ignore[no-untyped-call]
+                return loss.detach()
+
+            total += within_memory(part_loss, config.batch_size // self.parts, "batch_size / number of parts")
         value = float(self.processes.sum(total))
         if not math.isfinite(value):
             raise self._not_finite("loss", value)
@@ -256,7 +221,7 @@ class Pretrainer:
         """The loss of ``count`` scenes, each with one of its prompts, or without a prompt if it is withheld."""
         reads = self.prior.conditional
         scenes, prompts = self.data.draw(count, generator, prompts=reads)
-        x0 = scenes.to(self.config.device)
+        x0 = scenes.to(self.device)
         if not reads:
             return self.prior.pretraining_loss(x0, generator)
         choice = torch.rand(2, count, generator=generator).tolist()
@@ -272,8 +237,8 @@ class Pretrainer:
             group["initial_lr"] = group["rate"]
         return LambdaLR(self.optimizer, lambda step: learning_rate_at(step, self.config), last_epoch=self.step - 1)
 
-    def _averaged(self) -> AveragedWeights[nn.Module]:
-        return AveragedWeights(self.network, self.average)
+    def _averaged(self) -> AbstractContextManager[nn.Module]:
+        return averaged_weights(self.network, self.average)
 
     def _save(self) -> None:
         if self.processes.is_first:
@@ -285,7 +250,7 @@ class Pretrainer:
                 "optimizer": self.optimizer.state_dict(),
                 "step": self.step,
                 "seconds": self.seconds,
-                "evaluations": self.evaluations,
+                "history": self.history,
                 "data": self._data_facts(),
             }
             save_checkpoint(self.checkpoint_path, state)
@@ -314,20 +279,17 @@ class Pretrainer:
             )
         check_tensors(self.network, state["network"], self.checkpoint_path)
         try:
-            self.network.load_state_dict({**state["network"], **state["average"]})  # weights get their present names
-            average = WeightAverage(self.network, self.config.optimizer.ema)
+            self.history = state["history"]
             self.network.load_state_dict(state["network"])
+            self.average.restore(state["average"], state["average_updates"])
             self.optimizer.load_state_dict(state["optimizer"])
         except (RuntimeError, ValueError, KeyError) as error:
             raise InvalidInputError(
                 f"the run in {str(self.directory)!r} cannot be resumed: it has another network or optimiser; "
                 "give the same keys again, or another output"
             ) from error
-        self.average = average
-        self.average.updates = state["average_updates"]
         self.step, self.seconds = state["step"], state["seconds"]
         self.schedule = self._schedule()
-        self.evaluations = state["evaluations"]
         logger.info("resumed at step %d", self.step)
 
     def _data_facts(self) -> dict[str, Any]:

@@ -20,15 +20,10 @@ AdapterSpec = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 @dataclass(frozen=True)
 class AdapterTerm:
-    """One adapter of a sum.
+    """One adapter of a sum."""
 
-    Attributes:
-        path: path of a prior or of a run, or the name of a shipped prior.
-        factor: factor on its updates.
-    """
-
-    path: Path
-    factor: float = 1.0
+    path: Path  # of a prior or of a run, or the name of a shipped prior
+    factor: float = 1.0  # on its updates
 
 
 def parse_adapters(spec: AdapterSpec) -> list[AdapterTerm]:
@@ -51,18 +46,10 @@ def parse_adapters(spec: AdapterSpec) -> list[AdapterTerm]:
 
 
 def merge_adapters(base: StoredPrior, name: str, terms: Sequence[AdapterTerm]) -> StoredPrior:
-    """A prior with the updates of adapters added to its weights.
-
-    The update of a fine-tuned prior is its weights minus those of ``base`` (task arithmetic, Ilharco et al. 2023).
-
-    Args:
-        base: contents of the prior's files.
-        name: name of the prior, for messages.
-        terms: fine-tuned priors that were all trained from this prior.
-
-    Raises:
-        InvalidInputError: nothing is at a path, or an adapter is of another prior.
-        CorruptFileError: the files of an adapter are not those of a prior.
+    """The prior ``base``, called ``name``, with the updates of ``terms`` added to its weights, which are fine-tuned
+    priors that were all trained from it. The update of a fine-tuned prior is its weights minus those of ``base`` (task
+    arithmetic, Ilharco et al. 2023). An InvalidInputError if nothing is at a path, or an adapter is of another prior; a
+    CorruptFileError if the files of an adapter are not those of a prior.
     """
     read = [(term, read_stored(term.path)) for term in terms]
     differences = [_difference(base, name, term, stored) for term, stored in read]

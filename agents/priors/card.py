@@ -115,14 +115,9 @@ def prior_digest(prior: ScenePrior) -> str:
 
 
 def read_measures(path: str | os.PathLike[str]) -> tuple[dict[str, float], str | None]:
-    """The figures of ``scene-envs evaluate`` that are numbers, and the digest of the prior that was measured, if any.
-
-    Args:
-        path: ``metrics.json``, or the folder it is in.
-
-    Raises:
-        InvalidInputError: no such file, or no figure in it.
-        CorruptFileError: not JSON.
+    """The figures of ``scene-envs evaluate`` that are numbers, and the digest of the prior that was measured, if any,
+    from its ``metrics.json`` or the folder it is in. An InvalidInputError without such a file, or a figure in it; a
+    CorruptFileError if it is not JSON.
     """
     file = Path(path) / "metrics.json" if Path(path).is_dir() else Path(path)
     try:
@@ -148,7 +143,7 @@ def read_measures(path: str | os.PathLike[str]) -> tuple[dict[str, float], str |
 def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
     """The model card, Markdown."""
     card = facts.card
-    kind = "A text-conditioned" if facts.text else "An unconditional"
+    kind, strength = "A text-conditioned" if facts.text else "An unconditional", prior.config.physics_guidance
     prompt = " prompt='A scene with 12 objects.'" if facts.text else ""
     rows = {
         "scene type": f"{facts.scene_type}: {prior.scene_type.num_assets} assets, {facts.slots} slots",
@@ -158,7 +153,9 @@ def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
         "data": _data(card),
         "training": _training(card),
         "post-training": _post_training(card),
-        "sampling": _sampling(prior),
+        "sampling": f"with physics guidance of strength {strength:g}; `physics_guidance=0` turns it off"
+        if strength
+        else "",
         "licence of the data": str(card.get("license") or "not stated"),
     }
     table = "\n".join(["| | |", "|---|---|", *(f"| {key} | {text} |" for key, text in rows.items() if text)])
@@ -211,11 +208,6 @@ def _process(prior: ScenePrior, facts: PriorFacts) -> str:
     config = prior.config
     text = f"{facts.process}, T = {config.num_timesteps}, schedule {config.schedule}, prediction {config.prediction}"
     return f"{text}, categories {config.kernel}" if hasattr(config, "kernel") else text
-
-
-def _sampling(prior: ScenePrior) -> str:
-    strength = prior.config.physics_guidance
-    return f"with physics guidance of strength {strength:g}; `physics_guidance=0` turns it off" if strength else ""
 
 
 def _data(card: Mapping[str, Any]) -> str:

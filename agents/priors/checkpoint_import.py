@@ -204,11 +204,7 @@ def rename(state: Mapping[str, Any], file: str | os.PathLike[str]) -> dict[str, 
 
 
 def sizes(tensors: Mapping[str, Tensor], file: str | os.PathLike[str]) -> MixedFluxConfig:
-    """The size of the network, read from its tensors.
-
-    Raises:
-        CorruptFileError: a tensor from which a size is read is missing.
-    """
+    """The size of the network, read from its tensors; a CorruptFileError if one of them is missing."""
     try:
         hidden, width = tensors["scene_in.weight"].shape
         head = tensors["single_blocks.0.query_norm.weight"].shape[0]
@@ -278,11 +274,8 @@ def _with_categories(normalizer: Normalizer, scene: SceneType) -> Normalizer:
 
 
 def read_lightning(file: str | os.PathLike[str]) -> dict[str, Any]:
-    """The content of a Lightning checkpoint: tensors and plain data; everything else is a placeholder.
-
-    Raises:
-        InvalidInputError: no such file.
-        CorruptFileError: not a checkpoint, or without a ``state_dict``.
+    """The content of a Lightning checkpoint: tensors and plain data; everything else is a placeholder. An
+    InvalidInputError without the file; a CorruptFileError if it is no checkpoint, or has no ``state_dict``.
     """
     path = Path(file)
     if not path.is_file():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -109,7 +110,7 @@ class ContinuousPrior(ScenePrior):
         """Leading features of the continuous output that are poses."""
         return self.code.pose_width
 
-    @property
+    @cached_property
     def is_constant(self) -> Tensor:
         """(D,) bool: features that never vary."""
         return self.code.normalizer.is_constant
@@ -145,13 +146,12 @@ class ContinuousPrior(ScenePrior):
     def _reverse(self, x_t: Tensor, step: int, table: StepTableLike, eta: float) -> GaussianStep:
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         self.process.check_stride(t, previous)
-        x0 = self.denoiser(x_t, torch.full((x_t.shape[0],), t, device=x_t.device))
+        x0 = self.denoiser(x_t, t)
         if self.config.clip:
             x0 = x0.clamp(-self.config.clip, self.config.clip)
-        residual = None if self.residual is None else self.residual.at(t)
-        mean, std = self.process.posterior(x_t, x0, t, previous, residual, eta)
-        std_map = std * (~self.known(x_t.shape[1])).to(x_t.dtype)
-        return GaussianStep(self.clamp(mean), std_map, x0.detach())
+        x0_weight, xt_weight, std = self.stride(t, previous, eta, x_t)
+        mean = self.clamp(x0_weight * x0 + xt_weight * x_t)
+        return GaussianStep(mean, std * self.frame(x_t).moving, x0.detach())
 
     @torch.no_grad()
     def run_chain(

@@ -37,15 +37,8 @@ _LIMITS = {"slots": 10_000, "num_timesteps": 1_000_000, "seed": 2**63}
 
 
 def to_precision(weights: Mapping[str, Tensor], precision: str) -> dict[str, Tensor]:
-    """Weights in the number format of a file; half precision keeps 11 bits, a relative error of at most 2^-11.
-
-    Args:
-        weights: trained tensors by name.
-        precision: ``"float32"`` or ``"float16"``.
-
-    Raises:
-        UnknownNameError: another format.
-        InvalidInputError: a weight beyond the range of the format (its tensor is named).
+    """Weights in the number format of a file, ``"float32"`` or ``"float16"``; half precision keeps 11 bits, a relative
+    error of at most 2^-11. An UnknownNameError for another format, an InvalidInputError for a weight beyond its range.
 
     >>> to_precision({"bias": torch.tensor([0.1])}, "float16")["bias"].dtype
     torch.float16
@@ -121,35 +114,21 @@ def _weights_of(name: str | os.PathLike[str]) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class StoredPrior:
-    """Contents of the files of a prior.
-
-    Attributes:
-        process: name of its process.
-        fields: its configuration, as its class reads it.
-        scene_type: its scene type.
-        normalizer: normalizer of raw scenes.
-        preconditioning: moments of encoded scenes.
-        card: facts about its training.
-        residual: measured error of the denoiser, if it was measured.
-        tensors: weights by name.
-    """
+    """Contents of the files of a prior."""
 
     process: str
-    fields: dict[str, Any]
+    fields: dict[str, Any]  # its configuration, as its class reads it
     scene_type: SceneType
-    normalizer: Normalizer
-    preconditioning: Preconditioning
-    card: dict[str, Any]
-    residual: ResidualVariance | None
-    tensors: dict[str, Tensor]
+    normalizer: Normalizer  # of raw scenes
+    preconditioning: Preconditioning  # moments of encoded scenes
+    card: dict[str, Any]  # facts about its training
+    residual: ResidualVariance | None  # measured error of the denoiser
+    tensors: dict[str, Tensor]  # weights
 
 
 def read_stored(name: str | os.PathLike[str]) -> StoredPrior:
-    """The files of a shipped prior by name, or of one in a prior or run directory; its scene type is registered.
-
-    Raises:
-        UnknownNameError: no shipped prior has that name.
-        CorruptFileError: a file is truncated or not what its name says.
+    """The files of a shipped prior by name, or of one in a prior or run directory; its scene type is registered. Errors
+    are those of :func:`read_prior`.
     """
     state, tensors = read_prior(name)
     with explained(name):
@@ -281,37 +260,24 @@ HEADLINES = {
 
 @dataclass(frozen=True)
 class PriorFacts:
-    """Facts about a prior from its files.
+    """Facts about a prior from its files."""
 
-    Attributes:
-        name: name or path under which the prior was asked for.
-        scene_type: its scene type.
-        process: ``"continuous"`` or ``"mixed"``.
-        slots: slots per scene that it was trained on.
-        text: description of its text encoder; empty for a prior without text.
-        parameters: number of trained parameters in its file.
-        megabytes: size of its weights on disk, MB.
-        card: facts about its training and, under ``measures``, its figures.
-    """
-
-    name: str
+    name: str  # or path, under which the prior was asked for
     scene_type: str
-    process: str
-    slots: int
-    text: str
-    parameters: int
-    megabytes: float
-    card: Mapping[str, Any]
+    process: str  # ``"continuous"`` or ``"mixed"``
+    slots: int  # per scene, in training
+    text: str  # description of its text encoder; empty for a prior without text
+    parameters: int  # number of trained ones in its file
+    megabytes: float  # of its weights on disk, MB
+    card: Mapping[str, Any]  # facts about its training and, under ``measures``, its figures
 
     @classmethod
     def of(cls, name: str | os.PathLike[str]) -> PriorFacts:
-        """The facts of a shipped prior, or of one in a prior or run directory; weights are not read.
-
-        Raises:
-            UnknownNameError, InvalidInputError, CorruptFileError: as :func:`agents.priors.files.read_prior`.
+        """The facts of a shipped prior, or of one in a prior or run directory; weights are not read. Errors are as for
+        :func:`read_prior`.
         """
         folder, state = find_prior(name), read_config(name)
-        try:
+        with explained(name):
             made = state["prior"]
             return cls(
                 name=str(name),
@@ -323,10 +289,6 @@ class PriorFacts:
                 megabytes=(folder / WEIGHTS_NAME).stat().st_size / 1e6,
                 card=state["card"],
             )
-        except (KeyError, TypeError, AttributeError) as error:
-            raise CorruptFileError(
-                f"the configuration of the prior {str(name)!r} is not one of ours: {error}"
-            ) from error
 
     @property
     def measures(self) -> dict[str, float]:

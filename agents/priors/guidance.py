@@ -106,7 +106,7 @@ class PhysicsGuidance:
 
     def __init__(self, strength: float, movable: Tensor | None = None) -> None:
         self.strength = strength
-        self._movable = None if movable is None else movable.cpu().numpy()
+        self._movable = movable
 
     def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch], std: Tensor) -> Tensor | None:
         """(B, N, 3) m, how far the denoised positions move; None at steps at which nothing moves.
@@ -118,8 +118,7 @@ class PhysicsGuidance:
         """
         if not self.acts(std):
             return None
-        error = std.cpu().double().numpy()
-        return (self.strength * corrections(denoised().to("cpu"), error, self._movable)).to(std.device)
+        return self.strength * corrections(denoised(), std, self._movable)
 
     @staticmethod
     def acts(std: Tensor) -> bool:

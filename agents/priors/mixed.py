@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from agents.configuration.composition import check_types
 from agents.diffusion import CategoricalProcess, MixedStep, Preconditioning, ResidualVariance, StepTable
-from agents.diffusion.categorical import UNMASKINGS, make_categorical_schedule
+from agents.diffusion.categorical import UNMASKINGS, make_categorical_schedule, one_hot
 from agents.diffusion.gaussian import loss_weights
 from agents.diffusion.reverse_steps import ReverseStep, state_of
 from agents.networks.denoisers import MixedDenoiser, Observed
@@ -36,6 +36,7 @@ from agents.priors.prior import (
     draw_noise,
     no_text,
 )
+from scene_envs.arrays import constant_on
 from scene_envs.datasets.prompts.facts import SIDES
 from scene_envs.datasets.prompts.parser import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -223,7 +224,7 @@ class MixedPrior(ScenePrior):
         """K = C + 1."""
         return self.config.network.categories
 
-    @property
+    @cached_property
     def is_constant(self) -> Tensor:
         """(D,) bool: features of the pose that never vary."""
         constant = self.normalizer.is_constant.clone()
@@ -287,11 +288,11 @@ class MixedPrior(ScenePrior):
         already. If the chain only absorbs, the category that a slot holds already is not barred in this slot.
         """
         barred = torch.zeros(*state.shape, self.num_categories, dtype=torch.bool, device=state.device)
-        barred[:, len(self.scene_type.fixed) :, list(self.scene_type.fixed_categories)] = True
+        barred[:, len(self.scene_type.fixed) :] = constant_on(self._fixed_kinds, state.device)
         if closed is not None:
             barred |= closed[:, None]
         if self.categories.only_absorbs:
-            held = F.one_hot(state, self.num_categories + 1)[..., :-1] > 0
+            held = one_hot(state, self.num_categories, torch.bool)
             if self._separates_members:
                 barred[..., :-1] |= ~self._fitting_assets(held[..., :-1].any(dim=1))[:, None]
             barred &= ~held
@@ -303,6 +304,11 @@ class MixedPrior(ScenePrior):
         return self.config.union == "one_type" and len(self._members) > 1 and self.categories.only_absorbs
 
     @cached_property
+    def _fixed_kinds(self) -> Tensor:
+        """(K,) bool: categories of fixed objects."""
+        return torch.isin(torch.arange(self.num_categories), torch.tensor(self.scene_type.fixed_categories))
+
+    @cached_property
     def _members(self) -> Tensor:
         """(M, C) bool: assets of each member of a union of scene types; one row for any other type."""
         assets = self.scene_type.assets
@@ -310,7 +316,7 @@ class MixedPrior(ScenePrior):
 
     def _fitting_assets(self, present: Tensor) -> Tensor:
         """(B, C) bool: assets of the members that have all of ``present`` (B, C) bool; all if no member has them."""
-        members = self._members.to(present.device)
+        members = constant_on(self._members, present.device)
         fits = ~(present[:, None] & ~members).any(dim=-1)  # (B, M)
         allowed = (fits[..., None] & members).any(dim=1)
         return allowed | ~fits.any(dim=-1, keepdim=True)
@@ -348,41 +354,34 @@ class MixedPrior(ScenePrior):
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         self.process.check_stride(t, previous)
-        levels = torch.full((x_t.shape[0],), t, device=x_t.device)
         observed = self.observed_entries(x_t, observed)
         if free is None and (text is None or guidance):
             free = self.unconditional(x_t.shape[0])
-        pose, logits = self.denoiser(x_t, levels, observed, free if text is None else text)
+        pose, logits = self.denoiser(x_t, t, observed, free if text is None else text)
         if text is not None and guidance:
-            free_pose, free_logits = self.denoiser(x_t, levels, observed, free)
+            free_pose, free_logits = self.denoiser(x_t, t, observed, free)
             pose = (1 + guidance) * pose - guidance * free_pose
             logits = (1 + guidance) * logits.log_softmax(-1) - guidance * free_logits.log_softmax(-1)
         if self.config.clip:
             pose = pose.clamp(-self.config.clip, self.config.clip)
-        residual = None if self.residual is None else self.residual.at(t)
-        mean, std = self.process.posterior(x_t[..., :POSE_FEATURES], pose, t, previous, residual, eta)
-        states = x_t[..., POSE_FEATURES:]
-        state = state_of(states)
+        x0_weight, xt_weight, std = self.stride(t, previous, eta, x_t)
+        mean = x0_weight * pose + xt_weight * x_t[..., :POSE_FEATURES]
+        state, frame = state_of(x_t[..., POSE_FEATURES:]), self.frame(x_t)
+        known, values, moving = (part[:, :POSE_FEATURES] for part in (frame.known, frame.values, frame.moving))
         logits = logits.masked_fill(self.barred_categories(state, closed), -torch.inf)
         probs = self.categories.posterior(state, logits.softmax(dim=-1), t, previous)
-        slots, fixed = x_t.shape[1], len(self.scene_type.fixed)
-        random = torch.full((slots,), previous > 0, device=x_t.device)
-        random[:fixed] = False
-        known = self.known(slots)[:, :POSE_FEATURES]
-        zeros = torch.zeros(*mean.shape[:2], self.num_categories, device=mean.device)
-        clamped = self.clamp(torch.cat([mean, zeros], dim=-1))
+        random = frame.free if previous > 0 else torch.zeros_like(frame.free)
+        fixed = len(self.scene_type.fixed)
         if fixed:
-            certain = F.one_hot(self._fixed[:fixed, POSE_FEATURES:].argmax(dim=-1), self.num_categories + 1).to(probs)
+            certain = F.pad(frame.values[:fixed, POSE_FEATURES:], (0, 1))
             probs = torch.cat([certain.expand(len(probs), -1, -1), probs[:, fixed:]], dim=1)
         masked = (state == self.num_categories) & random if self._together else None
         groups = self.denoiser.groups_by_number(text) if self._systematic and text is not None else None
         category = logits.argmax(dim=-1)
         if self.categories.only_absorbs:
             category = torch.where(state < self.num_categories, state, category)
-        estimate = torch.cat([pose, F.one_hot(category, self.num_categories).to(pose)], dim=-1).detach()
-        return MixedStep(
-            clamped[..., :POSE_FEATURES], std * (~known).to(mean.dtype), probs, random, masked, estimate, groups
-        )
+        estimate = torch.cat([pose, one_hot(category, self.num_categories, pose.dtype)], dim=-1).detach()
+        return MixedStep(torch.where(known, values, mean), std * moving, probs, random, masked, estimate, groups)
 
     @torch.no_grad()
     def run_chain(

@@ -6,8 +6,9 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from torch import Generator, Tensor, nn
@@ -15,13 +16,14 @@ from torch import Generator, Tensor, nn
 from agents.configuration.prior_names import joint_name, split_name
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, ReverseStep, StepTable
 from agents.diffusion.gaussian import check_weighting, make_schedule, timestep_distribution, timestep_weights
-from agents.networks.denoisers import Observed
+from agents.networks.denoisers import Observed, check_precision
 from agents.networks.flux_modules import CountConditioning
 from agents.networks.registry import config_state
 from agents.networks.text import Text
 from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.files import StoredPrior, explained, read_stored, write_stored
 from agents.priors.guidance import Guide, Hook, Watch, guidance_hook, physics_strength
+from scene_envs.arrays import constant_on, within_memory
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.envs.settings import check_claim_guidance, check_guidance, check_physics_guidance
 from scene_envs.errors import InvalidInputError, unknown_name
@@ -90,6 +92,22 @@ class DenoiserOutput:
     logits: Tensor | None = None
 
 
+class Frame(NamedTuple):
+    """What is known of the entries of scenes of N slots.
+
+    Attributes:
+        known: (N, D) bool, entries that are clamped.
+        values: (N, D) what they are clamped to; 0 elsewhere.
+        free: (N,) bool, slots that no fixed object has.
+        moving: (N, D) 1 for entries that are not known, 0 for the others.
+    """
+
+    known: Tensor
+    values: Tensor
+    free: Tensor
+    moving: Tensor
+
+
 class ScenePrior(nn.Module, ABC):
     """A trained denoiser with its schedule, layout and normalizer. Tensors x are normalised scenes (B, N, D).
 
@@ -150,6 +168,8 @@ class ScenePrior(nn.Module, ABC):
         self.residual = residual
         fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
         self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
+        self._frames: dict[Any, Frame] = {}
+        self._strides: dict[Any, tuple[ResidualVariance | None, tuple[float, float, Tensor]]] = {}
         schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
         self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         distribution = timestep_distribution(config.timesteps, config.prediction)
@@ -272,24 +292,44 @@ class ScenePrior(nn.Module, ABC):
         """Leading features of the continuous output that are poses; the others, if any, are categories."""
         return POSE_FEATURES
 
-    @property
+    @cached_property
     def is_constant(self) -> Tensor:
         """(D,) bool: features that never vary."""
         return self.normalizer.is_constant
 
     def known(self, slots: int) -> Tensor:
         """(slots, D) bool: entries that are clamped (fixed welded slots, constant features)."""
-        known = self.is_constant.to(self._fixed.device).expand(slots, -1).clone()
+        known = constant_on(self.is_constant, self._fixed.device).expand(slots, -1).clone()
         known[: len(self.scene_type.fixed)] = True
         return known
 
     def clamp(self, x: Tensor) -> Tensor:
         """``x`` (B, N, D) with its known entries set to their values."""
-        count = len(self.scene_type.fixed)
-        x = torch.where(self.is_constant.to(x.device), torch.zeros_like(x), x)
-        if count:
-            x = torch.cat([self._fixed[:count].to(x).expand(x.shape[0], -1, -1), x[:, count:]], dim=1)
-        return x
+        frame = self.frame(x)
+        return torch.where(frame.known, frame.values, x)
+
+    def frame(self, x: Tensor) -> Frame:
+        """What is known of the entries of scenes ``x`` (B, N, D); computed once for each number of slots."""
+        key = x.shape[1], x.device, x.dtype
+        if key not in self._frames:
+            known, count = self.known(x.shape[1]).to(x.device), len(self.scene_type.fixed)
+            values = torch.cat([self._fixed[:count].to(x), x.new_zeros(x.shape[1] - count, known.shape[1])])
+            free = torch.arange(x.shape[1], device=x.device) >= count
+            self._frames[key] = Frame(known, values, free, (~known).to(x))
+        return self._frames[key]
+
+    def stride(self, t: int, previous: int, eta: float, like: Tensor) -> tuple[float, float, Tensor]:
+        """Weights of x_0 and x_t in the mean of a reverse step, and its std, () or (F,); computed once.
+
+        Errors are those of :meth:`~agents.diffusion.GaussianProcess.posterior`.
+        """
+        key = t, previous, eta, like.device
+        known = self._strides.get(key)
+        if known is None or known[0] is not self.residual:
+            residual = None if self.residual is None else self.residual.at(t)
+            x0_weight, xt_weight, std = self.process.posterior_weights(t, previous, residual, eta)
+            known = self._strides[key] = (self.residual, (x0_weight, xt_weight, std.to(like.device)))
+        return known[1]
 
     def encode(self, batch: SceneBatch) -> Tensor:
         """Normalised x_0 (B, N, D) of scenes.
@@ -338,6 +378,26 @@ class ScenePrior(nn.Module, ABC):
         """
         strength = physics_strength(strength, self.config, self.scene_type)
         self.config = replace(self.config, physics_guidance=strength)
+        return self
+
+    def with_precision(self: Prior, precision: str) -> Prior:
+        """This prior, whose chains compute the products of the network's blocks in ``precision``.
+
+        One of ``"float32"``, ``"tf32"`` and ``"bfloat16"``. Positions, relations, contacts, all that enters and leaves
+        the blocks, and the steps whose noise-to-signal ratio is at most 0.1 are always in float32. Training is not
+        changed.
+
+        Raises:
+            UnknownNameError: another word.
+            InvalidInputError: the device of the prior has no such products, or its network no such blocks.
+        """
+        check_precision(precision, self.device)
+        if precision != "float32" and not hasattr(self.denoiser.network, "body_precision"):
+            raise InvalidInputError(
+                f"precision={precision!r}: {type(self.denoiser.network).__name__} has no body_precision, which tells a "
+                "network the precision of its blocks; use precision=float32"
+            )
+        self.denoiser.chain_precision = precision
         return self
 
     def with_open_empty(self: Prior, share: float) -> Prior:
@@ -410,16 +470,20 @@ class ScenePrior(nn.Module, ABC):
         prompts = self._check_prompts(prompt, guidance, claim_guidance, count, wide)
         strength = physics_strength(physics_guidance, self.config, self.scene_type)
         generator, table = Generator(str(self.device)).manual_seed(seed), self.step_table(num_steps)
-        chunks = []
-        for start in range(0, count, batch_size):
-            texts = None if prompts is None else prompts[start : start + batch_size]
-            size = min(batch_size, count - start)
+
+        def denoised(start: int, size: int) -> Tensor:
+            texts = None if prompts is None else prompts[start : start + size]
             hook = self.sampling_hook(
                 size, wide, num_steps, prompts=texts, claim_guidance=claim_guidance, physics_guidance=strength
             )
             text = None if texts is None else self.encode_prompts(texts)
             x = self.initial(size, wide, generator)
-            chunks.append(self.run_chain(x, table, generator, text=text, guidance=guidance, eta=eta, hook=hook))
+            return self.run_chain(x, table, generator, text=text, guidance=guidance, eta=eta, hook=hook)
+
+        chunks = [
+            within_memory(partial(denoised, start), min(batch_size, count - start), "batch_size")
+            for start in range(0, count, batch_size)
+        ]
         return self.decode(torch.cat(chunks))
 
     @abstractmethod

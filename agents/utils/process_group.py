@@ -100,10 +100,6 @@ class ProcessGroup:
         """The sum of each number over all processes."""
         return list(values) if self.size == 1 else self.sum(torch.tensor(values, dtype=torch.float64)).tolist()
 
-    def largest(self, value: float) -> float:
-        """The largest ``value`` of all processes."""
-        return max(self.gather(value))
-
     def any(self, flag: bool) -> bool:
         """Whether ``flag`` is set in at least one process."""
         return self.sum_numbers(float(flag))[0] > 0
@@ -140,12 +136,7 @@ class ProcessGroup:
 
     def from_first(self, make: Callable[[], Value]) -> Value:
         """In every process, the value that ``make`` returns in the first one."""
-        if self.size == 1:
-            return make()
-        made: list[Any] = [make() if self.is_first else None]
-        with _distributed_errors():
-            distributed.broadcast_object_list(made, src=0)
-        return made[0]  # type: ignore[no-any-return]
+        return self.gather(make() if self.is_first else None)[0]  # type: ignore[return-value]
 
     def wait(self) -> None:
         """Wait until all processes have reached this call."""

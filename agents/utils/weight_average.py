@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Generic, TypeVar
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -39,11 +40,11 @@ class WeightAverage:
         return decay
 
     @torch.no_grad()
-    def restore(self, tensors: Mapping[str, Tensor], updates: int | None = None) -> None:
-        """Take the averages of a checkpoint, and the number of ``updates`` that made them, if it is given."""
+    def restore(self, tensors: Mapping[str, Tensor], updates: int) -> None:
+        """Take the averages of a checkpoint, and the number of ``updates`` that made them."""
         for name, present in self.tensors.items():
             present.copy_(tensors[name])
-        self.updates = self.updates if updates is None else updates
+        self.updates = updates
 
     @torch.no_grad()
     def copy_to(self, module: nn.Module) -> None:
@@ -52,21 +53,15 @@ class WeightAverage:
             parameter.copy_(self.tensors[name])
 
 
-class AveragedWeights(Generic[Module]):
-    """Context in which a module has its averaged weights, if there is an ``average``; then it gets its own back."""
-
-    def __init__(self, module: Module, average: WeightAverage | None) -> None:
-        self.module, self.average = module, average
-        self._own: dict[str, Tensor] = {}
-
-    def __enter__(self) -> Module:
-        if self.average is not None:
-            self._own = {name: p.detach().clone() for name, p in self.module.named_parameters()}
-            self.average.copy_to(self.module)
-        return self.module
-
-    def __exit__(self, *_: object) -> None:
-        with torch.no_grad():
-            for name, parameter in self.module.named_parameters():
-                if name in self._own:
-                    parameter.copy_(self._own[name])
+@contextmanager
+def averaged_weights(module: Module, average: WeightAverage | None) -> Iterator[Module]:
+    """Context in which ``module`` has its averaged weights, if there is an ``average``; then it gets its own back."""
+    if average is None:
+        yield module
+        return
+    own = WeightAverage(module, 0.0)
+    average.copy_to(module)
+    try:
+        yield module
+    finally:
+        own.copy_to(module)

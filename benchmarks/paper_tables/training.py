@@ -22,7 +22,6 @@ _RUN_ONLY = (
     "logger.log_every",
     "logger.evaluate_every",
     "logger.checkpoint_every",
-    "logger.pictures_every",
     "logger.name",
 )
 """Keys that may change between the parts of a resumed run."""

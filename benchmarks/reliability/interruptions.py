@@ -94,7 +94,7 @@ def _compare(name: str, command: Command, folder: Path, expected: Undisturbed, f
     if found != expected.digests:
         figures.different += 1
         figures.note(f"{name}: {[file for file in found if found[file] != expected.digests[file]]} differ")
-    left = [path.name for path in folder.rglob(".*") if path.name.endswith((".partial", ".lock", ".journal"))]
+    left = [path.name for path in folder.rglob(".*") if path.name.endswith((".partial", ".lock"))]
     if left:
         figures.silent += 1
         figures.note(f"{name} left {left}")

@@ -11,12 +11,15 @@ FILE = Path(__file__).parents[1] / "images" / "architecture.svg"
 ROWS: tuple[dict[str, tuple[int, str]], ...] = (
     {
         "scene_envs.assets": (0, "meshes, convex parts, masses"),
-        "agents.diffusion": (3, "forward and reverse processes"),
         "agents.utils": (4, "shared helpers"),
     },
     {"scene_envs.scene_types": (0, "assets, workspace, camera")},
     {"scene_envs.scene": (0, "SceneBatch, normalizer")},
-    {"scene_envs.physics": (0, "overlap, settling, projection"), "scene_envs.render": (1, "pictures, viewer")},
+    {
+        "scene_envs.physics": (0, "overlap, settling, projection"),
+        "scene_envs.render": (1, "pictures, viewer"),
+        "agents.diffusion": (3, "forward and reverse processes"),
+    },
     {"scene_envs.grammars": (0, "structures and exact poses"), "scene_envs.export": (1, "files for simulators")},
     {"scene_envs.datasets": (0, "verified scenes, prompts")},
     {"scene_envs.envs": (1, "denoising and search")},

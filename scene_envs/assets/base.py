@@ -114,11 +114,6 @@ class Asset:
     color: tuple[int, int, int]
     static: bool = False
 
-    @property
-    def article(self) -> str:
-        """The indefinite article of the display name, by sound."""
-        return indefinite_article(self.display_name)
-
     @cached_property
     def bounds(self) -> Array:
         """(2, 3): lowest and highest corner of the fine parts, m."""
@@ -166,10 +161,8 @@ class AssetLibrary:
 
 
 def register_asset_group(name: str, assets: Iterable[str]) -> None:
-    """Make ``name`` stand for several assets wherever assets are named; a group of that name is replaced.
-
-    Raises:
-        InvalidInputError: ``assets`` is one string.
+    """Make ``name`` stand for several assets wherever assets are named; a group of that name is replaced. Raises
+    InvalidInputError where ``assets`` is one string.
 
     >>> register_asset_group("doctest_round", ["dinner_plate", "steamer_bottom"])
     >>> sorted(ASSET_GROUPS.pop("doctest_round"))
@@ -231,14 +224,8 @@ class RecipeEntry:
 def asset_recipe(
     name: str, *, display_name: str, mass: float, color: tuple[int, int, int], plural: str | None = None
 ) -> Callable[[Recipe], Recipe]:
-    """Register the decorated function as the recipe of asset ``name``.
-
-    Args:
-        name: Identifier, unique in the library.
-        display_name: Name in prompts.
-        mass: Mass, kg; 0 makes the asset static.
-        color: Class colour (r, g, b) of semantic renders.
-        plural: Plural of the display name; the regular one by default.
+    """Register the decorated function as the recipe of asset ``name``, whose other facts are fields of :class:`Asset`;
+    ``mass`` (kg) 0 makes it static, and the plural is the regular one by default.
 
     Raises:
         InvalidInputError: the name is taken, or the mass is negative.

@@ -29,12 +29,10 @@ def know_folders(folders: Sequence[str | os.PathLike[str]]) -> None:
 
 
 def get_library(names: Sequence[str], folders: Sequence[str | os.PathLike[str]] = ()) -> AssetLibrary:
-    """The assets called ``names``, in this order; each is built once per process.
+    """The assets called ``names``, in this order, which is that of categories; each is built once per process.
 
-    Args:
-        names: Asset names in category order.
-        folders: Folders of users' own assets, searched in this order before the built-in ones. The folders of
-            registered scene types are searched last.
+    ``folders`` are those of users' own assets, searched in this order before the built-in ones. The folders of
+    registered scene types are searched last.
 
     Raises:
         UnknownNameError: neither a folder nor a recipe has that name; the nearest known one is offered.

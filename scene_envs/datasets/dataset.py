@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +20,18 @@ from scene_envs.datasets.files import (
     METADATA,
     DatasetInfo,
     Rows,
+    encode_shard,
     find_files,
     find_metadata,
     make_metadata,
     read_metadata,
     read_rows,
     shard_name,
-    to_rows,
-    write_shard,
+    write_bytes,
+    write_metadata,
 )
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
-from scene_envs.files import find_scenes, is_dataset, scene_files, with_digest, write_json
+from scene_envs.files import find_scenes, is_dataset, scene_files
 from scene_envs.normalizer import Normalizer
 from scene_envs.rotations import project_to_so3
 from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, ROTATION, SceneBatch
@@ -66,8 +67,8 @@ class SceneDataset:
     >>> shifted[:, 0, 0] = torch.arange(10) / 10
     >>> dataset = SceneDataset(shifted, ["A scene with 1 object."] * 10, Normalizer.fit(shifted), scenes.scene_type)
     >>> train, test = dataset.split((0.8, 0.2), seed=0)
-    >>> len(train), len(test), test.prompt_sets[0]
-    (8, 2, ('A scene with 1 object.',))
+    >>> len(train) + len(test), test.prompt_sets[0]
+    (10, ('A scene with 1 object.',))
     """
 
     tensor: Tensor
@@ -122,8 +123,17 @@ class SceneDataset:
         """
         files = find_files(path)
         layout = make_layout(metadata or find_metadata(path), scene_type, aliases, fixed_tolerance, slots)
-        blocks = (rows for file in files for rows in read_rows(file, layout.info.features))
-        dataset = cls._collect(blocks, layout, limit)
+        parts: list[Tensor] = []
+        sets: list[tuple[str, ...]] = []
+        for rows in itertools.chain.from_iterable(read_rows(file, layout.info.features) for file in files):
+            parts.append(layout.scenes(rows))
+            sets += rows.prompt_sets
+            if limit is not None and len(sets) >= limit:
+                break
+        width = max((part.shape[1] for part in parts), default=layout.scene_type.slots)
+        padded = [SceneBatch(part, layout.scene_type).with_slots(width).tensor for part in parts]
+        tensor = torch.cat(padded)[:limit] if parts else torch.empty(0, width, layout.scene_type.features)
+        dataset = cls.from_sets(tensor, sets[:limit], layout.normalizer, layout.scene_type, layout.info.metadata)
         own = metadata is None and (Path(path) / METADATA).is_file()
         if own and not dataset.complete and (limit is None or len(dataset) < limit):
             _LOGGER.warning(
@@ -134,46 +144,6 @@ class SceneDataset:
                 int(dataset.metadata["count"]),
             )
         return dataset
-
-    @classmethod
-    def from_huggingface(
-        cls,
-        dataset: Any,
-        metadata: str | os.PathLike[str],
-        *,
-        scene_type: str | SceneType | None = None,
-        aliases: Mapping[str, str] | None = None,
-        limit: int | None = None,
-        fixed_tolerance: float = FIXED_TOLERANCE,
-        slots: int | None = None,
-    ) -> SceneDataset:
-        """From a ``datasets.Dataset`` (one split, as ``load_dataset`` gives it) and its ``metadata.json``.
-
-        Arguments and errors as for :meth:`load`.
-        """
-        layout = make_layout(metadata, scene_type, aliases, fixed_tolerance, slots)
-
-        def rows() -> Iterator[Rows]:
-            start = 0
-            for table in dataset.with_format("arrow").iter(batch_size=2000):
-                yield to_rows(table, layout.info.features, "the dataset", start)
-                start += table.num_rows
-
-        return cls._collect(rows(), layout, limit)
-
-    @classmethod
-    def _collect(cls, blocks: Iterable[Rows], layout: Layout, limit: int | None) -> SceneDataset:
-        parts: list[Tensor] = []
-        sets: list[tuple[str, ...]] = []
-        for rows in blocks:
-            parts.append(layout.scenes(rows))
-            sets += rows.prompt_sets
-            if limit is not None and len(sets) >= limit:
-                break
-        width = max((part.shape[1] for part in parts), default=layout.scene_type.slots)
-        padded = [SceneBatch(part, layout.scene_type).with_slots(width).tensor for part in parts]
-        tensor = torch.cat(padded)[:limit] if parts else torch.empty(0, width, layout.scene_type.features)
-        return cls.from_sets(tensor, sets[:limit], layout.normalizer, layout.scene_type, layout.info.metadata)
 
     @classmethod
     def from_sets(
@@ -213,37 +183,21 @@ class SceneDataset:
         return SceneBatch(self.tensor[index], self.scene_type)
 
     def split(self, fractions: Sequence[float], seed: int = 0) -> tuple[SceneDataset, ...]:
-        """Disjoint random parts of the given sizes; fractions may sum to less than one.
+        """Disjoint parts of about the given sizes; fractions may sum to less than one.
 
-        Rows that repeat a scene (with another prompt) belong to the same part. When a dataset grows, scenes change
-        parts; :meth:`stable_split` keeps each scene in its part.
+        The part of a scene depends on a hash of its poses and ``seed`` alone. A scene therefore stays in its part when
+        the dataset grows or is read in another order, and rows that repeat it (with another prompt) share its part.
 
         Raises:
-            InvalidInputError: a fraction is negative, or they sum to more than one.
+            InvalidInputError: a fraction or ``seed`` is negative, or the fractions sum to more than one.
         """
-        check_fractions(fractions)
+        if not len(fractions) or any(fraction < 0 for fraction in fractions) or sum(fractions) > 1 + 1e-9:
+            raise InvalidInputError(f"fractions must be >= 0 and sum to at most 1, got {list(fractions)}")
         if seed < 0:
             raise InvalidInputError(f"a split needs seed >= 0, got {seed}")
-        _, first, group, sizes = np.unique(self.keys, return_index=True, return_inverse=True, return_counts=True)
-        shuffled = np.argsort(first)[np.random.default_rng(seed).permutation(len(sizes))]  # groups, in random order
-        ends = np.cumsum(sizes[shuffled])
-        position = np.empty(len(sizes), dtype=np.int64)  # position of a group's last row in the shuffled order
-        position[shuffled] = ends
-        order = np.argsort(position[group], kind="stable")
-        edges = [round(bound * len(self)) for bound in accumulate(fractions, initial=0.0)]
-        whole = [int(ends[np.searchsorted(ends, edge)]) if edge > 0 else 0 for edge in edges]
-        return tuple(self[torch.from_numpy(order[low:high])] for low, high in pairwise(whole))
-
-    def stable_split(self, fractions: Sequence[float], seed: int = 0) -> tuple[SceneDataset, ...]:
-        """Disjoint parts decided scene by scene, so that a scene keeps its part when the dataset grows.
-
-        The given sizes are met on average.
-
-        Raises:
-            InvalidInputError: a fraction is negative, or they sum to more than one.
-        """
-        keys, parts = self.keys, check_fractions(fractions)
-        inside = [Part(parts, index, seed).contains(keys) for index in range(len(parts))]
+        draws = mix_bits(self.keys ^ mix_bits(np.array([seed], dtype=np.uint64))) / 2.0**64  # (M,) in [0, 1]
+        bounds = itertools.pairwise(itertools.accumulate(map(float, fractions), initial=0.0))
+        inside = [(draws >= low) & ((draws < high) | (high >= 1 - 1e-9)) for low, high in bounds]
         return tuple(self[torch.from_numpy(np.flatnonzero(rows))] for rows in inside)
 
     def save(self, output: str | os.PathLike[str], *, shard_size: int = 2000) -> Path:
@@ -259,23 +213,18 @@ class SceneDataset:
         folder.mkdir(parents=True, exist_ok=True)
         metadata = make_metadata(self.scene_type, self.normalizer, count=len(self))
         metadata["max_num_objects_per_scene"] = self.tensor.shape[1]
-        write_json(folder / METADATA, with_digest(metadata), indent=2)
+        write_metadata(folder, metadata)
         for index, start in enumerate(range(0, len(self), shard_size)):
             chunk = slice(start, start + shard_size)
             scenes = self.normalizer.normalize(self.tensor[chunk]).numpy()
-            write_shard(folder / shard_name(index), scenes, self.prompt_sets[chunk], {})
+            write_bytes(folder / shard_name(index), encode_shard(scenes, self.prompt_sets[chunk], {}))
         return folder
 
 
 def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
-    """Scenes from a scene file, a folder of them, a run's folder with a scene file, a dataset or a file of a dataset.
-
-    Args:
-        path: File or folder.
-        count: Largest number of scenes, the first ones; None for all. Files are read in order of name.
-
-    Raises:
-        InvalidInputError: ``count`` is below 1, ``path`` does not exist, or its files are of several scene types.
+    """Scenes from a scene file, a folder of them, a run's folder with a scene file, a dataset or a file of a dataset:
+    the first ``count``, or all with None, of files in order of name. Raises InvalidInputError where ``count`` is below
+    1, ``path`` does not exist, or its files are of several scene types.
     """
     if count is not None and count < 1:
         raise InvalidInputError(f"count must be at least 1, or null for all, got {count}")
@@ -294,14 +243,9 @@ def load_scenes(path: Path, count: int | None = None) -> SceneBatch:
 
 
 def to_union(batch: SceneBatch, union: SceneType) -> SceneBatch:
-    """The same scenes in the categories of ``union``, with empty slots added up to the slots of ``union``.
-
-    Args:
-        batch: B scenes of a type whose assets ``union`` has.
-        union: Result of :func:`~scene_envs.scene_types.union_scene_type`, or any scene type with those assets.
-
-    Raises:
-        InvalidInputError: an asset that ``union`` lacks.
+    """The same scenes in the categories of ``union``, with empty slots added up to the slots of ``union``, which is a
+    result of :func:`~scene_envs.scene_types.union_scene_type` or any scene type with the assets in ``batch``. Raises
+    InvalidInputError for an asset that ``union`` lacks.
     """
     known = {name: index for index, name in enumerate(union.assets)}
     table = torch.tensor([known.get(name, -1) for name in batch.scene_type.assets] + [union.num_assets])
@@ -483,45 +427,3 @@ def mix_bits(values: Keys) -> Keys:
     values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return values ^ (values >> np.uint64(31))
-
-
-@dataclass(frozen=True)
-class Part:
-    """One of several disjoint parts of a dataset, decided scene by scene from the scene's key.
-
-    A scene stays in its part when the dataset grows or is read in another order, and rows that repeat it share its
-    part; so the fractions are only met on average. Raises InvalidInputError for wrong fractions, index or seed.
-
-    >>> keys = mix_bits(np.arange(10_000, dtype=np.uint64))
-    >>> train, test = (Part((0.9, 0.1), index).contains(keys) for index in (0, 1))
-    >>> int((train & test).sum()), int((train | test).sum()), abs(int(test.sum()) - 1000) < 150
-    (0, 10000, True)
-    """
-
-    fractions: tuple[float, ...]  # of all parts, in order; their sum may be below 1
-    index: int  # of this part
-    seed: int = 0  # of the assignment, not negative
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "fractions", check_fractions(self.fractions))
-        if not 0 <= self.index < len(self.fractions):
-            raise InvalidInputError(
-                f"there is no part {self.index} of {len(self.fractions)} parts; index goes from 0 to "
-                f"{len(self.fractions) - 1}"
-            )
-        if self.seed < 0:
-            raise InvalidInputError(f"a part needs seed >= 0, got {self.seed}")
-
-    def contains(self, keys: Keys) -> NDArray[np.bool_]:
-        """(M,) bool, True for scenes, given by their keys, that are in this part."""
-        draws = mix_bits(keys ^ mix_bits(np.array([self.seed], dtype=np.uint64))) / 2.0**64  # (M,) in [0, 1]
-        bounds = list(accumulate(self.fractions, initial=0.0))
-        low, high = bounds[self.index], bounds[self.index + 1]
-        return (draws >= low) & ((draws < high) | (high >= 1 - 1e-9))
-
-
-def check_fractions(fractions: Sequence[float]) -> tuple[float, ...]:
-    """The fractions; raises InvalidInputError when one is negative or they sum to more than one."""
-    if not len(fractions) or any(fraction < 0 for fraction in fractions) or sum(fractions) > 1 + 1e-9:
-        raise InvalidInputError(f"fractions must be >= 0 and sum to at most 1, got {list(fractions)}")
-    return tuple(float(fraction) for fraction in fractions)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
-from scene_envs.files import replacing, with_digest, without_digest
+from scene_envs.files import replacing, with_digest, without_digest, write_json, write_text
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE_FEATURES
 from scene_envs.scene_types import SceneType
@@ -57,25 +57,40 @@ def make_metadata(scene_type: SceneType, normalizer: Normalizer, **extra: Any) -
     }
 
 
+_CARD = """---
+configs:
+- config_name: default
+  data_files: "*.parquet"
+---
+
+# Scenes of {scene_type}
+
+Each row is a scene: `scenes` (slots x features, normalised as `metadata.json` says), `language_annotation` (one
+prompt) and `language_annotations` (all of them). `SceneDataset.load` of SceneEnvs reads this folder, and so does
+`load_dataset` of Hugging Face.
+"""
+
+
+def write_metadata(folder: Path, metadata: dict[str, Any]) -> None:
+    """``metadata.json``, and a dataset card (``README.md``) that names the data files to Hugging Face ``datasets``."""
+    card = folder / "README.md"
+    if not card.exists():
+        write_text(card, _CARD.format(scene_type=metadata["scene_type"]))
+    write_json(folder / METADATA, with_digest(metadata), indent=2)
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write one file, whole or not at all; raises :class:`StorageError`."""
     with replacing(path) as partial:
         partial.write_bytes(content)
 
 
-def write_shard(
-    path: Path, scenes: NDArray[np.float32], prompt_sets: Sequence[tuple[str, ...]], notes: Mapping[str, Any]
-) -> None:
-    """Write M scenes (M, N, D), normalised, to one parquet file; StorageError where nothing could be written.
-    ``language_annotations`` is left out when every scene has one prompt; ``notes`` go to the file's footer as JSON.
-    """
-    write_bytes(path, encode_shard(scenes, prompt_sets, notes))
-
-
 def encode_shard(
     scenes: NDArray[np.float32], prompt_sets: Sequence[tuple[str, ...]], notes: Mapping[str, Any]
 ) -> bytes:
-    """The bytes of the parquet file that :func:`write_shard` writes; equal for equal arguments."""
+    """The bytes of the parquet file of M scenes (M, N, D), normalised; equal for equal arguments.
+    ``language_annotations`` is left out when every scene has one prompt; ``notes`` go to the file's footer as JSON.
+    """
     count, slots, features = scenes.shape
     values = pa.array(np.ascontiguousarray(scenes).reshape(-1))
     rows = pa.ListArray.from_arrays(pa.array(np.arange(count * slots + 1, dtype=np.int32) * features), values)
@@ -93,7 +108,7 @@ def encode_shard(
 
 
 def read_notes(path: Path) -> dict[str, Any]:
-    """The facts that :func:`write_shard` kept in the footer, and ``rows``; raises CorruptFileError."""
+    """The facts that :func:`encode_shard` kept in the footer, and ``rows``; raises CorruptFileError."""
     file = open_parquet(path)
     footer = file.schema_arrow.metadata or {}
     try:
@@ -178,8 +193,9 @@ def find_metadata(path: str | os.PathLike[str]) -> Path:
 
 
 def read_rows(file: Path, features: int) -> Iterator[Rows]:
-    """The rows of one file of D = ``features`` features per slot, a block at a time. Raises CorruptFileError where it
-    cannot be read, columns are missing, or scenes have another width or gaps.
+    """The rows of one file of D = ``features`` features per slot, a block at a time. Scenes may be lists of lists,
+    fixed-size lists, Hugging Face ``Array2D``, or one flat list per scene, of half, single or double floats. Raises
+    CorruptFileError where the file cannot be read, columns are missing, or scenes have another width or gaps.
     """
     place, start = str(file), 0
     if file.suffix == ".arrow":
@@ -197,26 +213,18 @@ def read_rows(file: Path, features: int) -> Iterator[Rows]:
             ) from error
         if batch is None:
             return
-        if batch.num_rows:
-            yield to_rows(pa.Table.from_batches([batch]), features, place, start)
-            start += batch.num_rows
-
-
-def to_rows(table: pa.Table, features: int, place: str, start: int = 0) -> Rows:
-    """Scenes and prompts of a table with the columns of a dataset. ``scenes`` may be lists of lists, fixed-size lists,
-    Hugging Face ``Array2D``, or one flat list per scene, of half, single or double floats. Raises CorruptFileError for
-    missing columns and for ragged or incomplete scenes or those of another width.
-    """
-    _columns(table.column_names, place)
-    try:
-        scenes = _to_array(_one_array(table[SCENES]), features, start)
-        prompt_sets = _prompt_sets(table)
-    except (pa.ArrowException, ValueError) as error:
-        raise CorruptFileError(
-            f"cannot read scenes of {features} features per slot from {place!r}: {error}; "
-            "delete the file and generate again to remake it"
-        ) from error
-    return Rows(scenes, prompt_sets, place, start)
+        if not batch.num_rows:
+            continue
+        table = pa.Table.from_batches([batch])
+        try:
+            scenes, prompt_sets = _to_array(_one_array(table[SCENES]), features, start), _prompt_sets(table)
+        except (pa.ArrowException, ValueError) as error:
+            raise CorruptFileError(
+                f"cannot read scenes of {features} features per slot from {place!r}: {error}; "
+                "delete the file and generate again to remake it"
+            ) from error
+        yield Rows(scenes, prompt_sets, place, start)
+        start += batch.num_rows
 
 
 def _saved_files(folder: Path) -> list[Path]:
@@ -326,7 +334,6 @@ class DatasetInfo:
         welded_model_paths: Paths of the welded assets.
         slots: N, the number of slots per scene; None when the file does not say.
         scene_type: Name of the scene type; None in datasets of others.
-        count: Number of requested scenes; None when the file does not say.
         metadata: All keys of the file but the digest.
     """
 
@@ -336,7 +343,6 @@ class DatasetInfo:
     welded_model_paths: tuple[str, ...] = ()
     slots: int | None = None
     scene_type: str | None = None
-    count: int | None = None
     metadata: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -351,13 +357,8 @@ class DatasetInfo:
 
     def categories_in(self, scene_type: SceneType, aliases: Mapping[str, str] | None = None) -> Tensor:
         """(C + 1,) int64: the category of ``scene_type`` for each category of the files; empty maps to empty.
-
-        Args:
-            scene_type: Scene type of the result; it may have assets that the files lack.
-            aliases: Mapping of model paths, or their stems, to asset names.
-
-        Raises:
-            UnknownNameError: a model path that is no asset of the scene type.
+        ``aliases`` maps model paths, or their stems, to asset names. Raises UnknownNameError for a model path that is
+        no asset of the scene type, which may have assets that the files lack.
         """
         aliases = aliases or {}
         found = []
@@ -402,8 +403,8 @@ def _parse(file: Path, metadata: dict[str, Any]) -> DatasetInfo:
     paths = tuple(map(str, metadata["model_paths"] or ()))
     try:
         normalizer = Normalizer.from_state(metadata["normalizer_state"])
-        numbers = [metadata.get(key) for key in ("max_num_objects_per_scene", "count")]
-        slots, count = (None if number is None else int(number) for number in numbers)
+        number = metadata.get("max_num_objects_per_scene")
+        slots = None if number is None else int(number)
     except (InvalidInputError, TypeError, ValueError) as error:
         raise CorruptFileError(f"{str(file)!r}: {error}") from error
     for key, wanted in (("translation_vec_len", 3), ("model_path_vec_len", len(paths) + 1)):
@@ -417,7 +418,6 @@ def _parse(file: Path, metadata: dict[str, Any]) -> DatasetInfo:
         welded_model_paths=tuple(map(str, metadata.get("welded_object_model_paths") or ())),
         slots=slots,
         scene_type=metadata.get("scene_type"),
-        count=count,
         metadata=metadata,
     )
 

@@ -5,13 +5,13 @@ A shard depends on its :class:`Job` and the grammar alone.
 
 from __future__ import annotations
 
-import hashlib
+import itertools
 import math
 import os
 import pickle
 import sys
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,12 +31,13 @@ from scene_envs.datasets.files import (
     shard_name,
     verify,
     write_bytes,
+    write_metadata,
 )
 from scene_envs.datasets.prompts import describe_all
 from scene_envs.errors import CorruptFileError, InvalidInputError, PhysicsError, unknown_name
-from scene_envs.files import storage_error, sweep, with_digest, write_json
+from scene_envs.files import storage_error, sweep
 from scene_envs.grammars import Grammar, get_grammar
-from scene_envs.grammars.grammar import grammar_factory
+from scene_envs.grammars.grammar import GRAMMARS
 from scene_envs.normalizer import Normalizer
 from scene_envs.physics.engines import engine_name
 from scene_envs.progress import Progress
@@ -116,8 +117,8 @@ def generate(
     """Write ``count`` scenes with three prompts each into the folder ``output``.
 
     Each shard depends on (grammar, seed, shard index) alone, so the result depends neither on the number of workers nor
-    on their machines. A run killed at any point gives the same files when it is started again. Finished shards are
-    kept, and the verdicts of an unfinished shard are reused (with Ray an unfinished shard is made again).
+    on their machines. A run killed at any point gives the same files when it is started again: finished shards are
+    kept, and unfinished ones are made again.
 
     Args:
         scene_type: Name of a grammar (built-in ones are called like their scene type).
@@ -164,7 +165,13 @@ def generate(
     ) as report:
         if left:
             _make(left, scene_type, grammar, normalizer, report, workers, backend, address)
-    return _report(folder, jobs, count, perf_counter() - start)
+    reasons: Counter[str] = Counter()
+    tried = 0
+    for job in jobs:
+        notes = read_notes(job.path)
+        reasons.update(notes["reasons"])
+        tried += notes["tried"]
+    return GenerationReport(folder, count, tried, dict(reasons.most_common()), perf_counter() - start)
 
 
 def _make(
@@ -178,12 +185,15 @@ def _make(
     address: str | None,
 ) -> None:
     if backend == "processes" and not workers:
-        for job in jobs:
-            for progress in write_shard(job, grammar, normalizer):
-                report(*progress)
+
+        def written(job: Job) -> Generator[tuple[int, int, dict[str, int]]]:
+            write_bytes(job.path, (yield from make_shard(job, grammar, normalizer)))
+
+        for progress in itertools.chain.from_iterable(map(written, jobs)):
+            report(*progress)
         return
     is_ray = backend == "ray"
-    factory, scene_type = grammar_factory(name), get_scene_type(grammar.scene_type)
+    factory, scene_type = GRAMMARS[name], get_scene_type(grammar.scene_type)
     made = factory, replace(scene_type), normalizer.state()  # a copy of the scene type, without built assets
     inputs = _pickled(factory, made, is_ray)
 
@@ -193,12 +203,11 @@ def _make(
                 f"{task.name} {shard}, twice; finished shards are kept. When memory ran out, run again to resume, with "
                 "fewer workers"
             ) from shard
-        if shard is not None:
-            write_bytes(task.body.path, shard)
+        write_bytes(task.body.path, shard)
 
     with WorkerPool(
         f"{__name__}:ShardMaker",
-        (inputs, None if is_ray else main_module()),
+        (inputs, {} if is_ray else main_module()),
         workers=max(1, workers) if is_ray else min(workers, len(jobs)),
         stdout=2,  # what a grammar prints goes to stderr
         ray=is_ray,
@@ -227,15 +236,13 @@ def _pickled(factory: Any, inputs: tuple[Any, ...], is_ray: bool) -> bytes:
 
 
 class ShardMaker:
-    """Answers of a worker of a generation: whole shards. ``inputs`` are the pickled maker of the grammar, its scene
-    type and the normalizer's state; ``main`` is the parent's main module on the same machine, for which shards are
-    written, or None to return their bytes.
+    """Answers of a worker of a generation: the bytes of whole shards. ``inputs`` are the pickled maker of the grammar,
+    its scene type and the normalizer's state; ``main`` is the parent's main module, empty on another machine.
     """
 
-    def __init__(self, inputs: bytes, main: dict[str, Any] | None) -> None:
-        self._make = make_shard if main is None else write_shard
+    def __init__(self, inputs: bytes, main: dict[str, Any]) -> None:
         torch.set_num_threads(1)
-        import_main(main or {})
+        import_main(main)
         try:
             factory, scene_type, state = pickle.loads(inputs)
             register_scene_type(scene_type)
@@ -247,7 +254,7 @@ class ShardMaker:
 
     def __call__(self, job: Job) -> Any:
         """Make a shard, with reports of the progress."""
-        return self._make(job, self._grammar, self._normalizer)
+        return make_shard(job, self._grammar, self._normalizer)
 
 
 def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normalizer:
@@ -275,7 +282,7 @@ def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normal
     except OSError as error:
         raise storage_error(folder, error) from error
     normalizer = fixed_normalizer(grammar)
-    write_json(path, with_digest(make_metadata(scene_type, normalizer, **settings)), indent=2)
+    write_metadata(folder, make_metadata(scene_type, normalizer, **settings))
     return normalizer
 
 
@@ -288,17 +295,6 @@ def _is_made(job: Job) -> bool:
         raise CorruptFileError(f"{str(job.path)!r} holds {rows} scenes, expected {job.size}; delete it and run again")
     verify(job.path)
     return True
-
-
-def _report(folder: Path, jobs: list[Job], count: int, seconds: float) -> GenerationReport:
-    reasons: Counter[str] = Counter()
-    tried = 0
-    for job in jobs:
-        job.journal.remove()
-        notes = read_notes(job.path)
-        reasons.update(notes["reasons"])
-        tried += notes["tried"]
-    return GenerationReport(folder, count, tried, dict(reasons.most_common()), seconds)
 
 
 def fixed_normalizer(grammar: Grammar) -> Normalizer:
@@ -344,20 +340,16 @@ def judge_scenes(batch: SceneBatch, physics: str = "auto") -> list[str]:
     Runs in the calling process. Scenes are judged in the constructed poses; settling only tests them. The verdict on
     a scene does not depend on the others of the batch. ``physics`` names the engine.
     """
-    inside = (batch.in_workspace | batch.is_empty).all(dim=1)
-    verdicts = [KEPT if ok else "outside workspace" for ok in inside.tolist()]
-    candidates = torch.nonzero(inside).flatten()
-    if len(candidates):
-        for index, verdict in zip(candidates.tolist(), _physics(batch[candidates], physics), strict=True):
-            verdicts[index] = verdict
-    return verdicts
-
-
-def _physics(batch: SceneBatch, physics: str) -> list[str]:
     from scene_envs.physics import feasibility
 
+    inside = (batch.in_workspace | batch.is_empty).all(dim=1)
+    verdicts = ["outside workspace"] * len(batch)
+    candidates = torch.nonzero(inside).flatten()
+    if not len(candidates):
+        return verdicts
+    chosen = batch[candidates]
     result = feasibility(
-        batch,
+        chosen,
         max_penetration=MAX_PENETRATION,
         max_displacement=MAX_DISPLACEMENT,
         max_rotation=math.inf,
@@ -365,11 +357,13 @@ def _physics(batch: SceneBatch, physics: str) -> list[str]:
         physics=physics,
     )
     shallow = (result.depth <= MAX_PENETRATION).all(dim=1)
-    still = ((result.displacement <= MAX_DISPLACEMENT) | ~batch.is_free).all(dim=1)
-    return [
-        "physics failed" if not valid else "penetration" if not clear else "moved while settling" if not calm else KEPT
-        for valid, clear, calm in zip(result.valid.tolist(), shallow.tolist(), still.tolist(), strict=True)
-    ]
+    still = ((result.displacement <= MAX_DISPLACEMENT) | ~chosen.is_free).all(dim=1)
+    judged = (column.tolist() for column in (candidates, result.valid, shallow, still))
+    for index, valid, clear, calm in zip(*judged, strict=True):
+        verdicts[index] = (
+            "physics failed" if not valid else "penetration" if not clear else KEPT if calm else "moved while settling"
+        )
+    return verdicts
 
 
 @dataclass(frozen=True)
@@ -383,45 +377,24 @@ class Job:
     path: Path  # path of the shard's file
     physics: str = "auto"  # engine that verifies
 
-    @property
-    def journal(self) -> Journal:
-        """The journal of the shard, in the folder of its file."""
-        return Journal(self.path.with_name(f".{self.path.name}.journal"))
-
 
 def make_shard(
-    job: Job, grammar: Grammar, normalizer: Normalizer, journal: Journal | None = None
+    job: Job, grammar: Grammar, normalizer: Normalizer
 ) -> Generator[tuple[int, int, dict[str, int]], None, bytes]:
     """Yield the progress after each chunk, as arguments of a ``Report``; return the bytes of the shard's parquet file.
 
     Candidate k has a random generator of its own, seeded by (seed, shard, k), and the shard holds the first
-    ``job.size`` candidates that pass; so neither chunks nor an interruption change the result. Verdicts in the
-    ``journal`` of an interrupted attempt are not computed again. Raises PhysicsError when too many candidates in a row
-    fail, and StorageError where the journal cannot be written.
+    ``job.size`` candidates that pass; so chunks do not change the result. Raises PhysicsError when too many candidates
+    in a row fail.
     """
-    known = journal.read() if journal is not None else []
     kept: list[Tensor] = []
     reasons: Counter[str] = Counter()
     tried = fruitless = 0
     chunk = 1
     while len(kept) < job.size:
-        ahead = len(known) - tried
         start = perf_counter()
-        count = min(ahead, _MAX_CHUNK) if ahead > 0 else chunk
-        scenes, drawn = _draw(grammar, job, tried, count)
-        digests = [hashlib.blake2b(scene.numpy().tobytes(), digest_size=6).hexdigest() for scene in scenes]
-        if ahead > 0:
-            entries = [line.partition(" ") for line in known[tried : tried + count]]
-            if [digest for digest, _, _ in entries] != digests:  # the grammar has changed since
-                known, ahead = [], 0
-        if ahead > 0:
-            verdicts = [verdict for _, _, verdict in entries]
-        else:
-            verdicts = _judge(scenes, grammar, normalizer, job)
-            if journal is not None:
-                journal.append(
-                    tried, [f"{digest} {verdict}" for digest, verdict in zip(digests, verdicts, strict=True)]
-                )
+        scenes, drawn = _draw(grammar, job, tried, chunk)
+        verdicts = _judge(scenes, grammar, normalizer, job)
         before, fresh, first = reasons.copy(), len(kept), tried
         for scene, why, verdict in zip(scenes, drawn, verdicts, strict=True):
             if len(kept) == job.size:
@@ -439,9 +412,8 @@ def make_shard(
                 f"grammar {grammar.name!r}: {fruitless} scenes in a row were rejected; "
                 f"most frequent reasons: {dict(reasons.most_common(3))}"
             )
-        if ahead <= 0:
-            seconds = (perf_counter() - start) / count
-            chunk = max(1, min(_MAX_CHUNK, 2 * chunk, int(_CHUNK_SECONDS / max(seconds, 1e-6))))
+        seconds = (perf_counter() - start) / chunk
+        chunk = max(1, min(_MAX_CHUNK, 2 * chunk, int(_CHUNK_SECONDS / max(seconds, 1e-6))))
     batch = SceneBatch(torch.stack(kept), grammar.scene_type)
     prompt_sets = describe_all(batch, np.random.default_rng([job.seed, job.index, 1]))
     notes = {"tried": tried, "reasons": dict(sorted((+reasons).items()))}
@@ -465,63 +437,6 @@ def _judge(scenes: Tensor, grammar: Grammar, normalizer: Normalizer, job: Job) -
     fits = error < 1e-4  # False where a feature varies that is constant in the normalizer
     verdicts = judge_scenes(batch, job.physics) if job.verify else [KEPT] * len(batch)
     return [v if v != KEPT or ok else _UNFIT for v, ok in zip(verdicts, fits.tolist(), strict=True)]
-
-
-def write_shard(job: Job, grammar: Grammar, normalizer: Normalizer) -> Generator[tuple[int, int, dict[str, int]]]:
-    """Make one shard with a journal, and write it; yields as :func:`make_shard`, raises StorageError."""
-    write_bytes(job.path, (yield from make_shard(job, grammar, normalizer, job.journal)))
-    job.journal.remove()
-
-
-class Journal:
-    """An append-only text file with the number of a candidate and its verdict per line.
-
-    A process may be killed while it writes, so an incomplete last line is dropped. Two processes that make the same
-    shard may write by turns, because a worker may outlive its killed parent for a moment; a verdict that is written
-    twice counts once. The first :meth:`append` makes the file.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def read(self) -> list[str]:
-        """The verdicts on candidates 0, 1, … so far; an incomplete last line is cut off the file.
-
-        Raises:
-            StorageError: the file cannot be read or written.
-        """
-        try:
-            content = self.path.read_bytes()
-            whole = content[: content.rfind(b"\n") + 1]
-            if len(whole) < len(content):
-                self.path.write_bytes(whole)
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise storage_error(self.path, error) from error
-        verdicts: list[str] = []
-        for line in whole.decode(errors="replace").split("\n")[:-1]:
-            candidate, _, verdict = line.partition(" ")
-            if candidate == str(len(verdicts)):
-                verdicts.append(verdict)
-        return verdicts
-
-    def append(self, first: int, verdicts: Sequence[str]) -> None:
-        """Add the verdicts on candidates ``first``, ``first + 1``, …
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
-        lines = "".join(f"{candidate} {verdict}\n" for candidate, verdict in enumerate(verdicts, start=first))
-        try:
-            with self.path.open("ab") as file:
-                file.write(lines.encode())
-        except OSError as error:
-            raise storage_error(self.path, error) from error
-
-    def remove(self) -> None:
-        """Delete the file, when the shard is written."""
-        self.path.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from scene_envs.registry import lazy_names
 
 if TYPE_CHECKING:
-    from scene_envs.envs.branchable import NotBranchableError, check_branchable
     from scene_envs.envs.denoising import DenoisingCore, StepResult
     from scene_envs.envs.denoising_adapters import DenoisingEnv, DenoisingTorchRLEnv, DenoisingVectorEnv
     from scene_envs.envs.masks import MaskGenerator, list_masks, register_mask
@@ -27,7 +26,6 @@ __all__ = [
     "MaskChoiceProblem",
     "MaskChoiceState",
     "MaskGenerator",
-    "NotBranchableError",
     "ResetNeededError",
     "Score",
     "SearchEnv",
@@ -35,7 +33,6 @@ __all__ = [
     "SearchProblem",
     "SearchState",
     "StepResult",
-    "check_branchable",
     "list_masks",
     "register_mask",
 ]

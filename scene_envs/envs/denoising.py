@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.envs.scoring import EnvPrompts, RewardScorer, Score
+from scene_envs.envs.scoring import EnvPrompts, RewardScorer, Score, prior_device
 from scene_envs.envs.settings import DenoisingSettings, takes
 from scene_envs.envs.spaces import (
     STATE_BOUND,
@@ -23,7 +23,6 @@ from scene_envs.envs.spaces import (
     check_slots,
     decode_scenes,
     occupied,
-    prior_device,
     prior_features,
     resolve_scene_and_prior,
 )
@@ -97,7 +96,7 @@ class DenoisingCore:
             raise InvalidInputError(f"num_envs={num_envs!r}: at least one environment is needed")
         chosen = DenoisingSettings(**settings)
         self.num_envs = num_envs
-        self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior)
+        self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior, chosen.device)
         self.slots = check_slots(self.scene_type, chosen.slots)
         self._features = prior_features(self.prior)
         self.action_mode = chosen.action_mode
@@ -148,7 +147,7 @@ class DenoisingCore:
         return self._steps == self.num_steps
 
     def scenes(self) -> SceneBatch:
-        """The current scenes, decoded and on the CPU: rotations in SO(3), arg-max categories."""
+        """The current scenes, decoded on the device of the prior: rotations in SO(3), arg-max categories."""
         return decode_scenes(self.prior, self._x)
 
     def object_mask(self) -> Tensor:
@@ -167,12 +166,19 @@ class DenoisingCore:
         """
         observed = {
             "scene": self._x.clone(),
-            "timestep": torch.from_numpy(self.timesteps).unsqueeze(-1).to(self.device),
+            "timestep": self.column(self.timesteps),
             "object_mask": occupied(self._x, self.scene_type),
         }
         if self._tokens is not None:
             observed["prompt"] = self._tokens.clone()
         return observed
+
+    def column(self, values: np.ndarray) -> Tensor:
+        """One value (B,) per episode as a column (B, 1) on the device; where all are equal, nothing is copied there."""
+        column = torch.from_numpy(values).unsqueeze(-1)
+        if (values == values[0]).all():
+            return torch.full(column.shape, values[0].item(), dtype=column.dtype, device=self.device)
+        return column.to(self.device)
 
     def info(self, result: StepResult | None = None) -> dict[str, np.ndarray]:
         """(B,) numbers: step, timestep, objects, reward_valid and ``term_<name>`` for each term of the reward.
@@ -279,7 +285,7 @@ class DenoisingCore:
         together = len(ended) == count
         batch = self.scenes() if together else self.scenes()[torch.from_numpy(ended)]
         prompts = None if self.prompts is None else [self._prompts[row] for row in ended.tolist()]
-        score = self.scorer(batch, prompts).to(device)
+        score = self.scorer(batch, prompts)
         reward = replace_rows(reward, ended, score.value)
         valid = replace_rows(valid, ended, score.valid)
         for name in terms.keys() & score.terms.keys():

@@ -125,6 +125,7 @@ class DenoisingEnv(SpecMixin, gym.Env[Any, np.ndarray]):
     | `max_action` | `10.0` | bound of the action space |
     | `workers` | `0` | processes for physics in the reward; 0: in the calling process; `"ray"`: on a Ray cluster |
     | `physics` | `"auto"` | engine of motion: `bullet`, `mujoco`, `warp`; `auto`: Bullet if installed, else MuJoCo |
+    | `device` | `"auto"` | device of the network: `cpu`, `cuda`; `auto`: of a given prior, else the GPU if any |
     | `render_mode` | `None` | `"rgb_array"` renders the decoded current scene |
     | `prompt` | `None` | one prompt, a list to draw from, or `"grammar"` for descriptions of the grammar's scenes |
     | `guidance` | `0.0` | weight of classifier-free guidance in `noise` mode; needs a prompt |
@@ -260,7 +261,7 @@ class DenoisingTorchRLEnv(EnvBase):
         return observed
 
     def _observe(self, result: StepResult | None) -> TensorDict:
-        finished = torch.from_numpy(self.core.finished).unsqueeze(-1).to(self.core.device)
+        finished = self.core.column(self.core.finished)
         valid = torch.ones_like(finished) if result is None else result.valid.unsqueeze(-1)
         fields = {
             **self.core.observation(),

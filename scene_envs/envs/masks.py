@@ -41,18 +41,6 @@ def infeasible_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -
     return scene.is_free[0] & ~flags[0]
 
 
-def penetrating_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-    """The free objects that are more than 1 mm inside another object."""
-    mask = torch.zeros_like(scene.is_empty[0])
-    mask[sorted({slot for pair in _overlaps(scene) for slot in pair})] = True
-    return mask & scene.is_free[0]
-
-
-def unstable_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-    """The infeasible objects that overlap nothing: they fall, slide, or are outside the workspace."""
-    return infeasible_mask(scene, score, rng) & ~penetrating_mask(scene, score, rng)
-
-
 def infeasible_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
     """The infeasible objects and all empty slots, as in Pfaff et al. (2025)."""
     return infeasible_mask(scene, score, rng) | scene.is_empty[0]
@@ -70,7 +58,7 @@ def blamed_or_empty_mask(scene: SceneBatch, score: Score, rng: np.random.Generat
 
 def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
     """A random half of the free objects (rounded up), and all empty slots."""
-    free = torch.nonzero(scene.is_free[0]).flatten().numpy()
+    free = torch.nonzero(scene.is_free[0]).flatten().cpu().numpy()
     chosen = rng.choice(free, size=(len(free) + 1) // 2, replace=False)
     mask = scene.is_empty[0].clone()
     mask[torch.from_numpy(chosen)] = True
@@ -93,68 +81,7 @@ class EmptyMask:
         check_count("empty", "count", self.count)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated."""
         return _some(scene.is_empty[0], scene.tensor.shape[1] if self.count is None else self.count, rng)
-
-
-@dataclass(frozen=True)
-class LowestScoringMask:
-    """The ``count`` free objects of the lowest credit, ties at random; InvalidInputError without credits per object."""
-
-    count: int = 4
-
-    def __post_init__(self) -> None:
-        check_count("lowest_scoring", "count", self.count)
-
-    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated."""
-        if score.per_object is None:
-            raise InvalidInputError(
-                "mask=lowest_scoring needs an objective with credit per object; choose another mask"
-            )
-        credit = score.per_object[0].double().masked_fill(~scene.is_free[0], torch.inf).cpu().numpy()
-        order = np.lexsort((rng.random(len(credit)), credit))[: self.count]
-        mask = torch.zeros_like(scene.is_empty[0])
-        mask[torch.from_numpy(order)] = True
-        return mask & scene.is_free[0]
-
-
-@dataclass(frozen=True)
-class RegionMask:
-    """The free objects whose frames are in a box of the workspace, from ``low`` to ``high`` (x, y, z, m), and ``empty``
-    random empty slots.
-    """
-
-    low: Sequence[float] = (-np.inf, -np.inf, -np.inf)
-    high: Sequence[float] = (np.inf, np.inf, np.inf)
-    empty: int = 4
-
-    def __post_init__(self) -> None:
-        if len(self.low) != 3 or len(self.high) != 3 or any(a > b for a, b in zip(self.low, self.high, strict=True)):
-            raise InvalidInputError(f"mask=region: low={self.low} and high={self.high} are no corners x, y, z of a box")
-        check_count("region", "empty", self.empty)
-
-    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated."""
-        place = scene.translations[0]
-        inside = ((place >= torch.tensor(self.low)) & (place <= torch.tensor(self.high))).all(dim=-1)
-        return (inside & scene.is_free[0]) | _some(scene.is_empty[0], self.empty, rng)
-
-
-@dataclass(frozen=True)
-class ExplicitMask:
-    """Slots that the user lists by their indices."""
-
-    slots: Sequence[int] = ()
-
-    def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated."""
-        mask = torch.zeros_like(scene.is_empty[0])
-        outside = [slot for slot in self.slots if not 0 <= slot < len(mask)]
-        if outside or not self.slots:
-            raise InvalidInputError(f"mask=explicit: slots={list(self.slots)} must be some of 0..{len(mask) - 1}")
-        mask[list(self.slots)] = True
-        return mask
 
 
 @dataclass(frozen=True)
@@ -213,7 +140,7 @@ class CulpritsMask:
     at_least: int = 4
 
     def __post_init__(self) -> None:
-        check_count("culprits", "at_least", self.at_least)
+        check_count(type(self).__name__.removesuffix("Mask").lower(), "at_least", self.at_least)
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         """(N,) bool, True where a slot is regenerated; ``rng`` breaks ties and draws slots."""
@@ -231,7 +158,7 @@ class CulpritsMask:
 
 
 @dataclass(frozen=True)
-class BalancedMask:
+class BalancedMask(CulpritsMask):
     """The culprits of :class:`CulpritsMask`, and random slots until the shares of objects and of empty slots are equal.
 
     Such a mask does not depend on the content of slots, like the masks of training, so the number of objects stays the
@@ -239,13 +166,7 @@ class BalancedMask:
     until ``at_least`` slots are masked, if the scene has as many.
     """
 
-    at_least: int = 4
-
-    def __post_init__(self) -> None:
-        check_count("balanced", "at_least", self.at_least)
-
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
-        """(N,) bool, True where a slot is regenerated."""
         free, empty = scene.is_free[0], scene.is_empty[0]
         mask = CulpritsMask(at_least=0)(scene, score, rng)
         slots, objects = int((free | empty).sum()), int(free.sum())
@@ -257,10 +178,12 @@ class BalancedMask:
 
 def _culprits(scene: SceneBatch, bad: Tensor, rng: np.random.Generator) -> list[int]:
     """Slots of blamed objects (``bad``, (N,) bool), without those that are feasible once others are removed."""
+    from scene_envs.physics import penetration  # loads the physics libraries, which other masks do not need
+
     blamed = torch.nonzero(bad).flatten().tolist()
     if not blamed:
         return []
-    pairs = _overlaps(scene)
+    pairs = [pair.slots for pair in penetration(scene).pairs[0] if pair.depth > MAX_PENETRATION]
     overlapping = {slot for pair in pairs for slot in pair}
     welded = set(torch.nonzero(scene.is_welded[0]).flatten().tolist())
     return cover(pairs, welded, rng) + [slot for slot in blamed if slot not in overlapping]
@@ -282,13 +205,6 @@ def cover(pairs: Sequence[tuple[int, int]], fixed: Collection[int], rng: np.rand
         chosen.add(slot)
         left = [pair for pair in left if slot not in pair]
     return sorted(chosen)
-
-
-def _overlaps(scene: SceneBatch) -> list[tuple[int, int]]:
-    """Pairs of slots that overlap deeper than feasibility allows."""
-    from scene_envs.physics import penetration  # loads the physics libraries, which other masks do not need
-
-    return [pair.slots for pair in penetration(scene).pairs[0] if pair.depth > MAX_PENETRATION]
 
 
 def _some(candidates: Tensor, count: int, rng: np.random.Generator) -> Tensor:
@@ -317,15 +233,10 @@ _SHIPPED: dict[str, MaskGenerator] = {
     "blamed_or_empty": blamed_or_empty_mask,
     "culprits": CulpritsMask(),
     "empty": EmptyMask(),
-    "explicit": ExplicitMask(),
     "infeasible": infeasible_mask,
     "infeasible_or_empty": infeasible_or_empty_mask,
-    "lowest_scoring": LowestScoringMask(),
     "off_prompt": OffPromptMask(),
-    "penetrating": penetrating_mask,
     "random": random_mask,
-    "region": RegionMask(),
-    "unstable": unstable_mask,
 }
 _MASKS: Registry[MaskGenerator] = Registry(
     "mask generator", ENTRY_POINT_GROUP, _SHIPPED, read=lambda point: _checked(point.name, load_plugin(point))
@@ -333,10 +244,8 @@ _MASKS: Registry[MaskGenerator] = Registry(
 
 
 def register_mask(name: str) -> Callable[[Generator], Generator]:
-    """Make a mask generator available as ``mask=name``; the same name again replaces it.
-
-    Raises:
-        InvalidInputError: the name is not one word, or the decorated object cannot be called.
+    """Make a mask generator available as ``mask=name``; the same name again replaces it. Raises InvalidInputError where
+    the name is not one word, or the decorated object cannot be called.
 
     >>> @register_mask("doctest_empty")
     ... def empty_slots(scene, score, rng):
@@ -363,8 +272,8 @@ def resolve_mask(mask: Any) -> MaskGenerator:
     """A mask generator from its name, a mapping of its name and settings, or a function of that form. Raises
     UnknownNameError for an unknown name or setting, and InvalidInputError for anything else.
 
-    >>> resolve_mask({"name": "lowest_scoring", "count": 2})
-    LowestScoringMask(count=2)
+    >>> resolve_mask({"name": "empty", "count": 2})
+    EmptyMask(count=2)
     """
     if isinstance(mask, str):
         return _MASKS[mask]

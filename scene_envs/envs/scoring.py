@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from typing import Any, cast
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scene_envs.arrays import resolve_device
 from scene_envs.envs.settings import PROMPT_SOURCES, check_guidance
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.protocols import PriorLike, PromptedPriorLike, SceneScorer
@@ -25,20 +27,30 @@ function of a name or path that returns a :class:`~scene_envs.protocols.PriorLik
 
 
 def resolve_reward(reward: Any) -> SceneScorer:
-    """Scorer of ``reward``: a registered name, a mapping with settings, a function or a reward object.
-
-    Raises:
-        UnknownNameError: no reward has that name; the nearest known one is offered.
-        MissingDependencyError: no installed package resolves rewards.
+    """Scorer of ``reward``: a registered name, a mapping with settings, a function or a reward object. Raises
+    UnknownNameError for no reward of that name, and MissingDependencyError where no installed package resolves rewards.
     """
     return _resolver("reward")(reward)
 
 
-def resolve_prior(prior: Any) -> PriorLike:
-    """A prior from a name or a path; any other value is returned unchanged. Raises UnknownNameError for no shipped
-    prior of that name, and MissingDependencyError where no installed package resolves priors.
+def resolve_prior(prior: Any, device: str = "auto") -> PriorLike:
+    """A prior from a name or a path, on ``device`` (:func:`~scene_envs.arrays.resolve_device`). One that is given stays
+    where it is with ``"auto"``; on another device, a copy is returned. Raises UnknownNameError for no shipped prior of
+    that name, and MissingDependencyError where no installed package resolves priors.
     """
-    return _resolver("prior")(prior) if isinstance(prior, str) else prior
+    if isinstance(prior, str):
+        loaded = _resolver("prior")(prior)
+        return loaded.to(resolve_device(device)) if hasattr(loaded, "to") else loaded
+    if device == "auto" or not hasattr(prior, "to"):
+        return prior  # type: ignore[no-any-return]
+    target = torch.empty(0, device=resolve_device(device)).device
+    return prior if prior_device(prior) == target else deepcopy(prior).to(target)  # type: ignore[no-any-return]
+
+
+def prior_device(prior: PriorLike) -> torch.device:
+    """Device of the prior's weights; CPU for a prior without weights."""
+    parameters: Iterable[Tensor] = prior.parameters() if hasattr(prior, "parameters") else ()
+    return next((p.device for p in parameters), torch.device("cpu"))
 
 
 @cache
@@ -70,28 +82,22 @@ class Score:
     per_object: Tensor | None = None
     object_flags: Mapping[str, Tensor] = field(default_factory=dict)
 
-    def to(self, device: torch.device) -> Score:
-        """The same verdict on another torch device."""
-        return self._each(lambda values: values.to(device))
-
     def row(self, index: int) -> Score:
         """The verdict on one scene, as a batch of one."""
-        return self._each(lambda values: values[index : index + 1])
-
-    def _each(self, change: Callable[[Tensor], Tensor]) -> Score:
+        rows = slice(index, index + 1)
         return Score(
-            change(self.value),
-            change(self.valid),
-            {name: change(term) for name, term in self.terms.items()},
-            None if self.per_object is None else change(self.per_object),
-            {name: change(flag) for name, flag in self.object_flags.items()},
+            self.value[rows],
+            self.valid[rows],
+            {name: term[rows] for name, term in self.terms.items()},
+            None if self.per_object is None else self.per_object[rows],
+            {name: flag[rows] for name, flag in self.object_flags.items()},
         )
 
 
 class RewardScorer:
-    """Scorer of batches of scenes on the CPU; its reward, a name, mapping, function or object, is resolved once. The
-    ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
-    ``physics`` names the engine.
+    """Scorer of batches of scenes, on their device; its reward, a name, mapping, function or object, is resolved once.
+    The ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
+    ``physics`` names the engine. ``depends_on_batch``, ``averages_objects`` and ``counts_objects`` are the reward's.
 
     >>> scorer = RewardScorer("object_count")
     >>> scorer(SceneBatch.empty("dimsum_table", 2)).valid.tolist()
@@ -105,6 +111,10 @@ class RewardScorer:
                 f"workers={workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
             )
         self._score = resolve_reward(reward)
+        facts = "depends_on_batch", "averages_objects", "counts_objects"
+        self.depends_on_batch, self.averages_objects, self.counts_objects = (
+            bool(getattr(self._score, fact, False)) for fact in facts
+        )
         self.workers, self.physics = workers, physics
         self._pool: Any = None
 
@@ -115,21 +125,6 @@ class RewardScorer:
         value = torch.where(valid, output.value, torch.zeros_like(output.value)).float()
         terms = {name: torch.nan_to_num(term.float(), 0.0, 0.0, 0.0) for name, term in output.terms.items()}
         return Score(value, valid, terms, output.per_object, output.object_flags)
-
-    @property
-    def depends_on_batch(self) -> bool:
-        """Whether the score of a scene depends on the other scenes of its batch."""
-        return bool(getattr(self._score, "depends_on_batch", False))
-
-    @property
-    def averages_objects(self) -> bool:
-        """Whether the reward is a mean over the objects, so that an empty slot has no credit."""
-        return bool(getattr(self._score, "averages_objects", False))
-
-    @property
-    def counts_objects(self) -> bool:
-        """Whether the reward depends on which objects there are, wherever they are."""
-        return bool(getattr(self._score, "counts_objects", False))
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares for scenes of this size, None where it declares none."""

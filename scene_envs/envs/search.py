@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from scene_envs.envs.masks import MaskGenerator, mask_for_prompt, masked_slots, resolve_mask
-from scene_envs.envs.scoring import EnvPrompts, RewardScorer, Score
+from scene_envs.envs.scoring import EnvPrompts, RewardScorer, Score, prior_device
 from scene_envs.envs.settings import SearchMaskSettings, SearchSettings, TreeSettings, check_physics_guidance, takes
-from scene_envs.envs.spaces import check_slots, prior_device, resolve_scene_and_prior
+from scene_envs.envs.spaces import check_slots, resolve_scene_and_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
@@ -131,7 +131,7 @@ class SearchProblem:
 
     def _begin(self, chosen: TreeSettings) -> None:
         """Resolve all settings but the mask."""
-        self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior)
+        self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior, chosen.device)
         self.slots = check_slots(self.scene_type, chosen.slots)
         self.device = prior_device(self.prior)
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
@@ -196,10 +196,6 @@ class SearchProblem:
         if trace is not None:
             states = [replace(state, trace=trace(row)) for row, state in enumerate(states)]
         return states
-
-    def expand(self, state: SearchState, action: int) -> SearchState:
-        """The child of ``state`` under ``action``."""
-        return self.expand_batch([(state, action)])[0]
 
     def legal_actions(self, state: SearchState) -> Sequence[int]:
         """All inpaintings; none at ``max_depth`` and where nothing is left to improve."""
@@ -273,8 +269,8 @@ class SearchProblem:
 
     def _values(self, batch: SceneBatch) -> Tensor:
         """(B,) Φ of scenes; 0 where the objective cannot score one."""
-        score = self.scorer(batch.to("cpu"), None if self.prompt is None else [self.prompt] * len(batch))
-        return torch.where(score.valid, score.value / self.scale, torch.zeros(())).clamp(0.0, 1.0)
+        score = self.scorer(batch, None if self.prompt is None else [self.prompt] * len(batch))
+        return torch.where(score.valid, score.value / self.scale, torch.zeros(())).clamp(0.0, 1.0).cpu()
 
     def _score(self, batch: SceneBatch, origins: Sequence[tuple[int, tuple[int, ...], float]]) -> list[SearchState]:
         """States of ``batch``, given each one's (seed, path, value of the parent)."""

@@ -107,6 +107,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
     | `workers` | `0` | processes for physics in the objective; 0: in the calling process; `"ray"`: on a Ray cluster |
     | `physics` | `"auto"` | engine of motion: `bullet`, `mujoco`, `warp`; `auto`: Bullet if installed, else MuJoCo |
+    | `device` | `"auto"` | device of the network: `cpu`, `cuda`; `auto`: of a given prior, else the GPU if any |
     | `render_mode` | `None` | `"rgb_array"`: pictures, masked objects in red; `"human"`: a page in the browser |
     | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
     | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |
@@ -117,6 +118,8 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     `gym.make_vec("scene_envs:SceneEnvs/Search-v0", num_envs=4, ...)` runs copies one after another. Planners should use
     `expand_batch`, which denoises many children in one batch.
+
+    torchrl's `GymWrapper` takes one environment or copies with `vector_kwargs={"autoreset_mode": "Disabled"}`.
 
     ## Version History
 
@@ -130,7 +133,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         problem = SearchProblem(**settings)
         self._begin(problem, render_mode, spaces.MultiBinary(problem.slots))
 
-    def _begin(self, problem: SearchProblem, render_mode: str | None, regenerate: spaces.MultiBinary) -> None:
+    def _begin(self, problem: SearchProblem, render_mode: str | None, regenerate: spaces.Space[Any]) -> None:
         """Set up an environment over ``problem``; ``regenerate`` is the space of the observed masks."""
         self.render_mode = check_render_mode(render_mode, _RENDER_MODES)
         self._viewer: LiveViewer | None = None  # the page of "human", made at the first reset
@@ -375,7 +378,7 @@ class SearchMaskEnv(SearchEnv):
 
     ## Observation Space
 
-    The `Dict` of [Search-v0](search.md#observation-space), but `regenerate` is `MultiBinary((K, N))`: the slots that
+    The `Dict` of [Search-v0](search.md#observation-space), but `regenerate` is `Box(0, 1, (K, N), int8)`: the slots that
     each mask regenerates. `info` has the same keys; its `regenerate` is the number of slots that are in any mask.
 
     ## Rewards
@@ -384,13 +387,11 @@ class SearchMaskEnv(SearchEnv):
 
     ## Starting State
 
-    An episode starts from a sample of the prior; `self.np_random` draws the sample's seed. `reset(options={"state":
-    state})` starts from a given `MaskChoiceState` instead, and `options={"scene": batch}` from a given scene.
+    As in [Search-v0](search.md#starting-state); a state that is given is a `MaskChoiceState`.
 
     ## Episode End
 
-    The episode is `terminated` when nothing is left to improve: no mask has a slot, or Φ is 1. It is `truncated` at
-    depth `max_depth`, or when `max_nfe` denoiser evaluations are spent since the reset.
+    As in [Search-v0](search.md#episode-end); nothing is left to improve where no mask has a slot, or Φ is 1.
 
     ## Arguments
 
@@ -404,22 +405,9 @@ class SearchMaskEnv(SearchEnv):
     | argument | default | meaning |
     |---|---|---|
     | `masks` | `('culprits', 'infeasible', 'empty', 'infeasible_or_empty')` | the K [masks](../search.md#masks): names, mappings with settings, functions |
-    | `scene` | `None` | scene type; `None` is that of the prior, `"dimsum_table"` without one |
-    | `objective` | `"feasible_objects"` | any reward: name, mapping, function or object |
-    | `branching` | `4` | inpaintings of each mask to choose from |
-    | `max_depth` | `10` | actions per episode |
-    | `num_steps` | `50` | denoising steps per inpainting |
-    | `prior` | `None` | name, path or prior; `None` is the shipped prior of the scene type |
-    | `slots` | `None` | slots per scene; `None` is the scene type's number, more is allowed |
-    | `objective_scale` | `None` | objective at which Φ = 1; `None` is the largest it declares, else the free slots |
-    | `max_nfe` | `None` | denoiser evaluations per episode; `None` is any number |
-    | `workers` | `0` | processes for physics in the objective; 0: in the calling process; `"ray"`: on a Ray cluster |
-    | `physics` | `"auto"` | engine of motion: `bullet`, `mujoco`, `warp`; `auto`: Bullet if installed, else MuJoCo |
-    | `render_mode` | `None` | `"rgb_array"`: pictures, masked objects in red; `"human"`: a page in the browser |
-    | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
-    | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |
-    | `claim_guidance` | `0.0` | strength of guidance to the numbers and places that the prompt gives; needs a prompt |
-    | `physics_guidance` | `0.0` | strength with which objects are moved out of overlaps and onto supports, 0 to 1 |
+
+    The other arguments are those of [Search-v0](search.md#arguments), without `mask`; `branching` counts the
+    inpaintings of each mask.
 
     ## Vectorized environment
 
@@ -435,7 +423,7 @@ class SearchMaskEnv(SearchEnv):
     @takes(SearchMaskSettings)
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
         problem = MaskChoiceProblem(**settings)
-        self._begin(problem, render_mode, spaces.MultiBinary((len(problem.mask_names), problem.slots)))
+        self._begin(problem, render_mode, spaces.Box(0, 1, (len(problem.mask_names), problem.slots), np.int8))
 
     def _child(self, state: SearchState, action: int) -> SearchState:
         is_action = isinstance(action, int | np.integer) and 0 <= action < self.problem.num_actions

@@ -19,8 +19,7 @@ PROMPT_SOURCES = ("data", "grammar")
 _MAX_SLOTS = 100_000
 _MAX_NUMBER = 1e30
 MASKS = (
-    "balanced", "blamed_or_empty", "culprits", "empty", "explicit", "infeasible", "infeasible_or_empty",
-    "lowest_scoring", "off_prompt", "penetrating", "random", "region", "unstable",
+    "balanced", "blamed_or_empty", "culprits", "empty", "infeasible", "infeasible_or_empty", "off_prompt", "random",
 )  # fmt: skip
 """Names of the mask generators of :mod:`scene_envs.envs.masks`."""
 
@@ -30,18 +29,7 @@ Init = TypeVar("Init", bound=Callable[..., None])
 
 @dataclass(frozen=True, kw_only=True)
 class EnvSettings:
-    """Settings of every environment.
-
-    Attributes:
-        scene: Scene type or its name; None means that of the prior, and ``dimsum_table`` without one.
-        prior: Name, path or prior; None means the shipped prior of the scene type.
-        num_steps: Number of denoising steps of an episode of denoising, or of each scene of a search.
-        slots: N, the number of slots per scene; None means the scene type's.
-        workers: Number of physics worker processes; 0 computes in this process, ``"ray"`` on a Ray cluster.
-        physics: Engine that computes motion: ``bullet``, ``mujoco`` or ``warp``; ``auto`` takes Bullet where it is
-            installed, else MuJoCo.
-        prompt: Description of the wanted scenes, for priors that read prompts; None for none.
-        guidance: Weight of classifier-free guidance in the prior's own steps; needs a prompt.
+    """Settings of every environment, which the tables of arguments of the environments' classes describe.
 
     Raises:
         InvalidInputError: a number is outside its range.
@@ -53,6 +41,7 @@ class EnvSettings:
     slots: int | None = None
     workers: int | str = 0
     physics: str = "auto"
+    device: str = "auto"
     prompt: Any = None
     guidance: float = 0.0
 
@@ -77,11 +66,6 @@ class EnvSettings:
 class DenoisingSettings(EnvSettings):
     """Settings of the denoising environments.
 
-    Attributes:
-        reward: Name, mapping, function or reward object.
-        action_mode: ``"next_sample"`` or ``"noise"``.
-        max_action: Bound to which the entries of actions are clipped.
-
     Raises:
         InvalidInputError, UnknownNameError: a value is outside its range.
     """
@@ -105,16 +89,6 @@ class DenoisingSettings(EnvSettings):
 @dataclass(frozen=True, kw_only=True)
 class TreeSettings(EnvSettings):
     """Settings of both search environments.
-
-    Attributes:
-        objective: Any reward: name, mapping, function or reward object.
-        branching: B, the number of inpaintings to choose from.
-        max_depth: Largest number of actions per episode.
-        objective_scale: Objective at which Φ is 1; None means the largest value that it declares, or else the number
-            of free slots.
-        max_nfe: Largest number of denoiser evaluations per episode; None for any number.
-        claim_guidance: Strength of guidance to the numbers and places that the prompt gives; needs a prompt.
-        physics_guidance: Strength with which objects are moved out of overlaps and onto supports, 0 to 1.
 
     Raises:
         InvalidInputError: a value is outside its range.
@@ -144,25 +118,14 @@ class TreeSettings(EnvSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class SearchSettings(TreeSettings):
-    """Settings of the search environment with one mask.
-
-    Attributes:
-        mask: Name of a mask generator, a mapping with its settings, or a function; see :mod:`scene_envs.envs.masks`.
-    """
+    """Settings of the search environment with one mask, as :func:`~scene_envs.envs.masks.resolve_mask` takes it."""
 
     mask: Any = "blamed_or_empty"
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchMaskSettings(TreeSettings):
-    """Settings of the search environment with a choice of masks.
-
-    Attributes:
-        masks: The K masks, each like ``mask`` of :class:`SearchSettings`.
-
-    Raises:
-        InvalidInputError: no list, or an empty one.
-    """
+    """Settings of the search environment with a choice of masks; InvalidInputError for no list, or an empty one."""
 
     masks: Sequence[Any] = ("culprits", "infeasible", "empty", "infeasible_or_empty")
 
@@ -223,7 +186,7 @@ def _shown(value: Any) -> str:
     return "a very large number" if isinstance(value, int) and abs(value) > _MAX_NUMBER else repr(value)[:200]
 
 
-def takes(settings: type[EnvSettings]) -> Callable[[Init], Init]:
+def takes(settings: type[Any]) -> Callable[[Init], Init]:
     """Decorator of an ``__init__`` with ``**settings``: its signature shows the fields of ``settings``."""
 
     def decorate(init: Init) -> Init:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium.error
@@ -25,14 +25,16 @@ STATE_BOUND = 10.0
 """Normalised scenes are kept within ±10. Data lies in [-1, 1] and no float32 normal draw exceeds 6.8."""
 
 
-def resolve_scene_and_prior(scene: str | SceneType | None, prior: Any) -> tuple[SceneType, PriorLike]:
-    """The scene type, and its prior: the given one, or the shipped one of the scene type's name. Without a scene type,
-    that of the prior is taken; without both, ``dimsum_table``.
+def resolve_scene_and_prior(
+    scene: str | SceneType | None, prior: Any, device: str = "auto"
+) -> tuple[SceneType, PriorLike]:
+    """The scene type, and its prior on ``device``: the given one, or the shipped one of the scene type's name. Without
+    a scene type, that of the prior is taken; without both, ``dimsum_table``.
     """
     if scene is None and prior is None:
         scene = DEFAULT_SCENE
     named = None if scene is None else get_scene_type(scene)
-    resolved = resolve_prior(named.name if prior is None and named is not None else prior)
+    resolved = resolve_prior(named.name if prior is None and named is not None else prior, device)
     if not isinstance(resolved, PriorLike):
         raise InvalidInputError(f"prior={prior!r} is not a prior; give a name, a path or a prior object")
     scene_type = resolved.scene_type if named is None else named
@@ -54,12 +56,6 @@ def check_slots(scene_type: SceneType, slots: int | None) -> int:
     return slots
 
 
-def prior_device(prior: PriorLike) -> torch.device:
-    """Device of the prior's weights; CPU for a prior without weights."""
-    parameters: Iterable[Tensor] = prior.parameters() if hasattr(prior, "parameters") else ()
-    return next((p.device for p in parameters), torch.device("cpu"))
-
-
 def scene_box(bound: float, slots: int, features: int) -> spaces.Box:
     """Box(-bound, bound, (N, D), float32)."""
     return spaces.Box(-bound, bound, (slots, features), np.float32)
@@ -71,10 +67,10 @@ def prior_features(prior: PriorLike) -> int:
 
 
 def decode_scenes(prior: PriorLike, x: Tensor) -> SceneBatch:
-    """The scenes of x (B, N, D) on the CPU: rotations in SO(3), arg-max categories."""
+    """The scenes of x (B, N, D), on its device: rotations in SO(3), arg-max categories."""
     if isinstance(prior, EncodedPriorLike) and prior.features != prior.scene_type.features:
-        return prior.decode(x.cpu())
-    return SceneBatch.from_tensor(x.cpu(), prior.scene_type, normalised=prior.normalizer)
+        return prior.decode(x)
+    return SceneBatch.from_tensor(x, prior.scene_type, normalised=prior.normalizer)
 
 
 def occupied(x: Tensor, scene_type: SceneType) -> Tensor:
@@ -132,7 +128,7 @@ def picture(batch: SceneBatch, highlight: Tensor | None = None) -> np.ndarray:
     """(B, H, W, 3) uint8 pictures, with the objects of ``highlight`` (B, N) bool in red (loads the renderer)."""
     from scene_envs.render import render
 
-    return render(batch, style="picture", highlight=highlight)
+    return render(batch.to("cpu"), style="picture", highlight=highlight)
 
 
 class ResetNeededError(SceneEnvsError, gymnasium.error.ResetNeeded):

@@ -1,8 +1,7 @@
-"""Files of one scene without physics: ``.npz``, a pickled dictionary of the same arrays, and a coloured ``.glb``."""
+"""Files of one scene without physics: ``.npz`` and a coloured ``.glb``."""
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +9,19 @@ import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
-from scene_envs.export.placed import AssetFiles, PlacedScene
+from scene_envs.export.placed import AssetFiles, PlacedScene, textured_mesh
 
 Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """World frame (z up) to the frame of glTF (y up)."""
 
 
-def scene_arrays(scene: PlacedScene) -> dict[str, Any]:
-    """Arrays of both files, for the n objects of a scene in slot order: ``translations`` (n, 3) float64 m,
-    ``rotations`` (n, 3, 3) float64, ``categories`` and ``slots`` (n,) int64, ``welded`` (n,) bool, ``names`` (n,) text,
-    ``asset_names`` (C,) text in category order, and ``scene_type``, one text.
+def write_npz(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
+    """``scene.npz``, which ``numpy.load`` alone can read, of the n objects of a scene in slot order: ``translations``
+    (n, 3) float64 m, ``rotations`` (n, 3, 3) float64, ``categories`` and ``slots`` (n,) int64, ``welded`` (n,) bool,
+    ``names`` (n,) text, ``asset_names`` (C,) text in category order, and ``scene_type``, one text.
     """
-    objects = scene.objects
-    return {
+    path, objects = folder / "scene.npz", scene.objects
+    arrays: dict[str, Any] = {
         "translations": np.array([item.translation for item in objects], dtype=np.float64).reshape(-1, 3),
         "rotations": np.array([item.rotation for item in objects], dtype=np.float64).reshape(-1, 3, 3),
         "categories": np.array([item.category for item in objects], dtype=np.int64),
@@ -32,19 +31,7 @@ def scene_arrays(scene: PlacedScene) -> dict[str, Any]:
         "asset_names": np.array(scene.scene_type.assets, dtype=str),
         "scene_type": np.array(scene.scene_type.name),
     }
-
-
-def write_npz(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
-    """``scene.npz``, which ``numpy.load`` alone can read."""
-    path = folder / "scene.npz"
-    np.savez(path, **scene_arrays(scene))
-    return path
-
-
-def write_pickle(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
-    """``scene.pkl``: the same arrays as a dictionary; only numpy is needed to load it."""
-    path = folder / "scene.pkl"
-    path.write_bytes(pickle.dumps(scene_arrays(scene), protocol=4))
+    np.savez(path, **arrays)
     return path
 
 
@@ -53,7 +40,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     graph = trimesh.Scene(base_frame="world")
     graph.graph.update("z_up", "world", matrix=Y_UP)
     for asset in scene.assets:
-        graph.geometry[files.name(asset)] = files.textured(asset)
+        graph.geometry[files.name(asset)] = textured_mesh(asset)
     for item in scene.objects:
         graph.graph.update(item.name, "z_up", matrix=item.matrix, geometry=files.name(item.asset))
     path = folder / "scene.glb"

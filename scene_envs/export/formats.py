@@ -66,7 +66,6 @@ _SHIPPED = (
     ExportFormat("usd", "USD with UsdPhysics", f"{_HERE}.usd:write_scene", "pxr", "usd-core"),
     ExportFormat("glb", "coloured mesh, no physics", f"{_HERE}.arrays:write_scene"),
     ExportFormat("npz", "numpy arrays", f"{_HERE}.arrays:write_npz"),
-    ExportFormat("pickle", "dictionary of numpy arrays", f"{_HERE}.arrays:write_pickle"),
 )
 _FORMATS = Registry(
     "export format",

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -214,7 +214,6 @@ class AssetFiles:
         self.package = package
         self._names = identifiers(asset.name for asset in assets)
         self._done: dict[tuple[str, str], Any] = {}
-        self._textured: dict[str, trimesh.Trimesh] = {}
 
     def name(self, asset: Asset) -> str:
         """The asset's name as an identifier, which is also the name of its folder."""
@@ -236,12 +235,6 @@ class AssetFiles:
     def visual(self, asset: Asset) -> Path:
         """``visual.obj`` with normals, its colours in ``visual.png``; one material, ``visual.mtl``."""
         return self.once(asset, "visual", lambda folder: _write_visual(visual_mesh(asset), folder))
-
-    def textured(self, asset: Asset) -> trimesh.Trimesh:
-        """The mesh with its palette in memory, for formats that embed meshes; writes nothing."""
-        if asset.name not in self._textured:
-            self._textured[asset.name] = textured_mesh(asset)
-        return self._textured[asset.name]
 
     def parts(self, asset: Asset) -> list[Path]:
         """``part_00.obj`` …, the fine convex parts."""
@@ -292,6 +285,7 @@ class Palette:
         return cls(image, uv, cells.ravel())
 
 
+@lru_cache(maxsize=64)
 def textured_mesh(asset: Asset) -> trimesh.Trimesh:
     """The asset's mesh with a palette texture on a matt material; corners of several colours are split."""
     from PIL import Image

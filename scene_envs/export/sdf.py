@@ -7,12 +7,16 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from scene_envs.arrays import Array
 from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, number, numbers
 from scene_envs.export.urdf import DRAKE, drake_contact, relative, write_xml
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
-    """``world.sdf``: one model per object, static when it is welded; poses are quaternions."""
+    """``world.sdf``: one model per object, static when it is welded.
+
+    Rotations are roll, pitch and yaw, which every reader knows; PyBullet's takes quaternions for such angles.
+    """
     root = ET.Element("sdf", {"version": "1.9", "xmlns:drake": DRAKE})
     world = ET.SubElement(root, "world", name=f"{scene.scene_type.name}_{scene.index}")
     light = ET.SubElement(world, "light", type="directional", name="sun")
@@ -27,8 +31,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
 def _add_model(world: ET.Element, item: PlacedObject, files: AssetFiles, folder: Path) -> None:
     asset = item.asset
     model = ET.SubElement(world, "model", name=item.name)
-    pose = _text(model, "pose", numbers(np.concatenate([item.translation, np.roll(item.quaternion, -1)])))
-    pose.set("rotation_format", "quat_xyzw")
+    _text(model, "pose", numbers(np.concatenate([item.translation, roll_pitch_yaw(item.rotation)])))
     if item.welded:
         _text(model, "static", "true")
     link = ET.SubElement(model, "link", name=files.name(asset))
@@ -57,6 +60,21 @@ def _add_mesh(parent: ET.Element, path: Path, folder: Path) -> ET.Element:
     mesh = ET.SubElement(ET.SubElement(parent, "geometry"), "mesh")
     _text(mesh, "uri", relative(path, folder))
     return mesh
+
+
+def roll_pitch_yaw(rotation: Array) -> Array:
+    """(3,) angles (rad) about the fixed axes x, y, z, in this order, whose rotation is ``rotation`` (3, 3).
+
+    Roll is what is left once yaw is undone, so that the rotation is exact at a pitch of 90 degrees too.
+
+    >>> roll_pitch_yaw(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])).round(6).tolist()
+    [0.0, 0.0, 1.570796]
+    """
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    sin, cos = np.sin(yaw), np.cos(yaw)
+    pitch = np.arctan2(-rotation[2, 0], cos * rotation[0, 0] + sin * rotation[1, 0])
+    roll = np.arctan2(sin * rotation[0, 2] - cos * rotation[1, 2], cos * rotation[1, 1] - sin * rotation[0, 1])
+    return np.array([roll, pitch, yaw]) + 0.0
 
 
 def _text(parent: ET.Element, tag: str, text: str) -> ET.Element:

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
@@ -116,17 +115,13 @@ class Stack:
                 f"weight, or it never ends; got at_most={self.at_most}, then={dict(self.then)}"
             )
 
-    @cached_property
-    def _next(self) -> tuple[list[str | None], list[float]]:
-        return list(self.then), list(accumulate(self.then.values()))
-
     def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
-        options, cumulative = self._next
+        options = list(self.then)
         while True:
             assets = [self.base]
             following: str | None = self.base
             while following == self.base and len(assets) <= self.at_most:
-                following = options[bisect_right(cumulative, rng.random() * cumulative[-1])]
+                following = options[_chosen(self.then.values(), rng)]
                 if following is not None:
                     assets.append(following)
             if len(assets) <= self.at_most:
@@ -153,14 +148,9 @@ class Pile:
     def __post_init__(self) -> None:
         _require_weights("Pile", [weight for weight, _ in self.members])
 
-    @cached_property
-    def _cumulative(self) -> list[float]:
-        return list(accumulate(weight for weight, _ in self.members))
-
     def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
-        count = self.height.draw(rng)
-        draws = (bisect_right(self._cumulative, rng.random() * self._cumulative[-1]) for _ in range(count))
-        assets = tuple(self.members[index][1] for index in draws)
+        weights = [weight for weight, _ in self.members]
+        assets = tuple(self.members[_chosen(weights, rng)][1] for _ in range(self.height.draw(rng)))
         return [Tower(assets, self.where, None, self.yaw)] if assets else []
 
 
@@ -191,13 +181,8 @@ class OneOf:
         _require_weights("OneOf", [weight for weight, _ in options])
         object.__setattr__(self, "options", options)
 
-    @cached_property
-    def _cumulative(self) -> list[float]:
-        return list(accumulate(weight for weight, _ in self.options))
-
     def draw(self, rng: np.random.Generator, reasons: Counter[str]) -> list[Tower]:
-        index = bisect_right(self._cumulative, rng.random() * self._cumulative[-1])
-        return self.options[index][1].draw(rng, reasons)
+        return self.options[_chosen((weight for weight, _ in self.options), rng)][1].draw(rng, reasons)
 
 
 @dataclass(frozen=True)
@@ -227,15 +212,11 @@ class Geometric:
                 f"got p={self.p}, low={self.low}, high={self.high}, present={self.present}"
             )
 
-    @cached_property
-    def _cumulative(self) -> list[float]:
-        return list(accumulate((1.0 - self.p) ** n for n in range(self.high - self.low + 1)))
-
     def draw(self, rng: np.random.Generator) -> int:
         """One count."""
         if rng.random() >= self.present:
             return 0
-        return self.low + bisect_right(self._cumulative, rng.random() * self._cumulative[-1])
+        return self.low + _chosen(((1.0 - self.p) ** n for n in range(self.high - self.low + 1)), rng)
 
 
 @dataclass(frozen=True)
@@ -257,6 +238,12 @@ class Repeat:
                 return towers
             reasons[failed] += 1
         raise InvalidInputError(f"a grammar's condition {failed!r} did not hold in 100,000 draws; it cannot be met")
+
+
+def _chosen(weights: Iterable[float], rng: np.random.Generator) -> int:
+    """The index of one of several ``weights``, drawn in proportion to them."""
+    cumulative = list(accumulate(weights))
+    return bisect_right(cumulative, rng.random() * cumulative[-1])
 
 
 def _require_weights(word: str, weights: Collection[float]) -> None:

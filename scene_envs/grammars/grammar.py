@@ -135,15 +135,10 @@ def register_grammar(name: str) -> Callable[[Callable[[], Grammar]], Callable[[]
 
 
 def get_grammar(scene_type: str | SceneType | Grammar) -> Grammar:
-    """A fresh grammar by its name (built-in grammars are called like their scene type)."""
+    """A fresh grammar by its name; built-in ones are called like their scene type. Raises UnknownNameError."""
     if isinstance(scene_type, Grammar):
         return scene_type
-    return grammar_factory(scene_type.name if isinstance(scene_type, SceneType) else scene_type)()
-
-
-def grammar_factory(name: str) -> Callable[[], Grammar]:
-    """The function registered as ``name``; raises UnknownNameError with the nearest known name."""
-    return GRAMMARS[name]
+    return GRAMMARS[scene_type.name if isinstance(scene_type, SceneType) else scene_type]()
 
 
 def list_grammars() -> list[str]:

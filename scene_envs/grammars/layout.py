@@ -74,10 +74,6 @@ class Tower:
         """The same tower in a frame at (``x``, ``y``) m, turned by ``yaw`` rad."""
         return replace(self, where=Moved(self.where, x, y, yaw), yaw=self.yaw.turned(yaw))
 
-    def count(self) -> int:
-        """Number of objects in this tower, on it, in it and next to it."""
-        return sum(len(tower.assets) + len(tower.contents) for tower in self.walk())
-
 
 @dataclass(frozen=True)
 class Surface:
@@ -155,10 +151,8 @@ class Standing:
             least = min(0.6 * self.radius, 0.012 * len(contents) / (2.0 * math.pi) + 0.004)
             foot = least + rng.random() * max(0.0, self.radius - across - 0.004 - least)
             lean = math.atan2(0.97 * self.radius - foot - 0.006, rim - floor)
-            outward, tangent = (
-                np.array([math.cos(azimuth), math.sin(azimuth), 0.0]),
-                np.array([-math.sin(azimuth), math.cos(azimuth), 0.0]),
-            )
+            outward = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+            tangent = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
             shaft = math.sin(lean) * outward + math.cos(lean) * np.array([0.0, 0.0, 1.0])
             side = tangent if rng.random() < 0.5 else -tangent
             rotation = np.stack([shaft, side, np.cross(shaft, side)], axis=1)
@@ -187,9 +181,7 @@ class Heap:
         poses = []
         for asset in contents:
             if self.upright:
-                yaw = rng.random() * 2.0 * math.pi
-                cos, sin = math.cos(yaw), math.sin(yaw)
-                rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+                rotation = np.array(about_z(rng.random() * 2.0 * math.pi)).reshape(3, 3)
             else:
                 rotation, triangle = np.linalg.qr(rng.standard_normal((3, 3)))
                 rotation = rotation * np.sign(np.diag(triangle))
@@ -336,17 +328,13 @@ class Layout:
             placed = self._add(free, surface, tower, frame, height, rng)
             if placed is None:
                 if self.reasons.total() == noted:  # no failure on it or in it was the cause
-                    self._note_failure(tower, towers[:count])
+                    name = tower.assets[0] if tower.assets else "what stands on a fixed object"
+                    others = Counter(other.assets[0] for other in towers[:count] if other.assets).most_common(1)
+                    where = f"beside {others[0][0]!r}" if others else "on its empty surface"
+                    self.reasons[f"no room for {name!r} {where}"] += 1
                 return None
             poses += placed
         return poses
-
-    def _note_failure(self, tower: Tower, standing: Sequence[Tower]) -> None:
-        """Count that ``tower`` has no room, together with the most frequent asset on its surface."""
-        name = tower.assets[0] if tower.assets else "what stands on a fixed object"
-        others = Counter(other.assets[0] for other in standing if other.assets).most_common(1)
-        where = f"beside {others[0][0]!r}" if others else "on its empty surface"
-        self.reasons[f"no room for {name!r} {where}"] += 1
 
     def _add(
         self, free: FreeSurface, surface: Surface, tower: Tower, frame: Frame, height: float, rng: np.random.Generator

@@ -47,13 +47,11 @@ class Gaussian:
         return math.cos(self.direction), math.sin(self.direction), self.along, across
 
     def draw(self, rng: np.random.Generator) -> tuple[float, float]:
-        """One position (x, y), m."""
         cos, sin, along, across = self._axes
         u, v = along * rng.standard_normal(), across * rng.standard_normal()
         return self.x + cos * u - sin * v, self.y + sin * u + cos * v
 
     def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """(P,) log density up to a constant, at ``points`` (P, 2); None for a point or a line."""
         cos, sin, along, across = self._axes
         if along == 0.0 or across == 0.0:
             return None
@@ -71,12 +69,10 @@ class Uniform:
     y: float = 0.0
 
     def draw(self, rng: np.random.Generator) -> tuple[float, float]:
-        """One position (x, y), m."""
         x = self.x + self.half_x * (2.0 * rng.random() - 1.0)
         return x, self.y + self.half_y * (2.0 * rng.random() - 1.0)
 
     def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P,) 0 inside, minus infinity outside."""
         inside = (np.abs(points[:, 0] - self.x) <= self.half_x) & (np.abs(points[:, 1] - self.y) <= self.half_y)
         return np.where(inside, 0.0, -np.inf)
 
@@ -89,13 +85,11 @@ class Line:
     end: tuple[float, float]
 
     def draw(self, rng: np.random.Generator) -> tuple[float, float]:
-        """One position (x, y), m."""
         (x, y), (end_x, end_y), t = self.start, self.end, rng.random()
         return x + t * (end_x - x), y + t * (end_y - y)
 
     def log_density(self, points: NDArray[np.float64]) -> None:
-        """None: a line has no density in the plane."""
-        return None
+        return None  # a line has no density in the plane
 
 
 @dataclass(frozen=True)
@@ -108,13 +102,11 @@ class Moved:
     yaw: float
 
     def draw(self, rng: np.random.Generator) -> tuple[float, float]:
-        """One position (x, y), m."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         x, y = self.distribution.draw(rng)
         return self.x + cos * x - sin * y, self.y + sin * x + cos * y
 
     def log_density(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """(P,) log density up to a constant, at ``points`` (P, 2)."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
         return self.distribution.log_density(np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=1))
@@ -363,10 +355,8 @@ class Region:
         )
 
     def limits(self, foot: float) -> tuple[float, float, float]:
-        """Bounds (m) for the frame of a child whose footprint holds a disc of radius ``foot``.
-
-        Returns:
-            Largest distance from the centre of the rectangle in x and in y, and from the support's origin.
+        """Bounds (m) for the frame of a child whose footprint holds a disc of radius ``foot``: the largest distance
+        from the centre of the rectangle in x and in y, and from the support's origin.
         """
         over = min(0.0, self.overhang - foot)
         return self.half_x + over, self.half_y + over, max(0.0, self.radius - foot)
@@ -444,10 +434,7 @@ class FreeSurface:
         """Place one child at a draw of ``where`` restricted to the free region; None when there is no room.
 
         A few plain draws are tried first. On a crowded support the free cells are enumerated, and one of them is drawn
-        in proportion to its density.
-
-        Returns:
-            Position x, y (m), and the yaw (rad) of each of its ``levels``.
+        in proportion to its density. The result is the position x, y (m), and the yaw (rad) of each of its ``levels``.
         """
         region = self.region
         half_x, half_y, radius = region.limits(outline.foot)

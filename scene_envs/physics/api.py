@@ -19,8 +19,8 @@ from scene_envs.rotations import geodesic_angle, project_to_so3
 from scene_envs.scene import SceneBatch, require_rigid_poses
 
 _LOGGER = logging.getLogger(__name__)
-_CHUNK = 8
-"""Scenes per message to a worker."""
+_CHUNK, _OWN_CHUNK = 8, 32
+"""Scenes per message to a worker, and scenes that this process computes together."""
 
 Rows = list[dict[str, Any] | None]
 """Results of a kernel, one per scene."""
@@ -56,8 +56,7 @@ def run_kernel(
     translations = batch.translations.double().cpu().numpy()
     rotations = batch.rotations.double().cpu().numpy()
     categories = batch.categories.cpu().numpy()
-    workers = max(1, pool.workers)
-    size = max(1, min(_CHUNK, -(-len(batch) // workers)))
+    size = max(1, min(_CHUNK, -(-len(batch) // pool.workers))) if pool.workers else _OWN_CHUNK
     limits = None if units is None else units.double().cpu().numpy()
     whole = Chunk(
         batch.scene_type, translations, rotations, categories, limits, None if calm is None else calm.cpu().numpy()

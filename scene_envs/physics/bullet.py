@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.errors import PhysicsError
-from scene_envs.physics.engines import CONVERGED, DAMPING, ITERATIONS, Course, Moved, gravity
+from scene_envs.physics.engines import CONVERGED, DAMPING, ITERATIONS, Course, Moved, fallen, gravity
 from scene_envs.physics.parts import (
     FRICTION,
     LevelGeometry,
@@ -44,7 +44,7 @@ MARGIN = 1e-3 / SCALE
 _PARKING = 1000.0
 """Height (Bullet units) of the first parked body; the next ones are above it."""
 _PARKING_STEP = 10.0 * SCALE
-_SPARE_BODIES = 12
+_SPARE_BODIES = 32
 _SPARE_FACTOR = 3
 """A pool is built again when it has more bodies than this many times the bodies that a scene needs, plus
 ``_SPARE_BODIES``: in every step Bullet compares the boxes of all bodies, including parked ones."""
@@ -263,6 +263,11 @@ class BulletEngine:
         if duration > _LONG and creeping.any() and not course.budget.is_spent:
             moved = self._run(cluster, fine, duration, course, _Settings(_USUAL_STEP, CONVERGED))
         return moved
+
+    def fall(self, duration: float) -> tuple[float, float]:
+        """See :class:`~scene_envs.physics.engines.Engine`."""
+        steps = max(1, round(duration / _USUAL_STEP))
+        return fallen(steps, _USUAL_STEP), steps
 
     def _run(self, cluster: Objects, fine: Mask, duration: float, course: Course, settings: _Settings) -> Moved:
         with self._lock:

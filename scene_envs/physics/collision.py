@@ -31,9 +31,6 @@ TOO_MANY = 20_000_000
 """Limit of corner tests in the overlapping object pairs of one scene; above it, depths are upper bounds."""
 
 
-_NOTHING: tuple[Index, Index, Array] = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
-
-
 @dataclass(frozen=True, eq=False)
 class ObjectOverlaps:
     """Pairs of objects that overlap, in ascending order."""
@@ -78,44 +75,25 @@ class Collider:
             touching = overlapping[gap[overlapping] > -TOUCHING]
             depth[touching] = -gap[touching]
             exact = overlapping[~rough[overlapping] & (gap[overlapping] <= -TOUCHING)]
-            involved = np.zeros(len(objects), dtype=bool)
-            involved[first[exact]] = involved[second[exact]] = True
-            found = self.overlaps(objects, involved)
+            found = self.overlaps(objects, first[exact], second[exact])
             rough[exact] |= np.isin(objects.scene[first[exact]], found.unmeasured)
             count = len(objects)
-            listed = np.searchsorted(wanted := found.first * count + found.second, first[exact] * count + second[exact])
-            listed = np.minimum(listed, max(len(wanted) - 1, 0))
-            if len(wanted):
-                depth[exact] = np.where(
-                    wanted[listed] == first[exact] * count + second[exact], found.depth[listed], 0.0
-                )
+            key = first[exact] * count + second[exact]
+            depth[exact[np.isin(key, found.first * count + found.second)]] = found.depth
             depth[rough] = -gap[rough]
         return ObjectPairs(first, second, gap, direction, depth, low, high, contacts, rough)
 
-    def overlaps(self, objects: Objects, involved: Mask | None = None) -> ObjectOverlaps:
-        """Overlapping pairs of the ``involved`` (n,) objects of some scenes, by their fine parts; of all by default."""
-        rows = np.arange(len(objects)) if involved is None else np.flatnonzero(involved)
-        x, y, z = objects.translation[rows].T
-        rows = rows[np.lexsort((x, y, z, objects.category[rows], objects.scene[rows]))]  # does not depend on slots
-        found, unmeasured = [], []
-        for scene in np.unique(objects.scene[rows]).tolist():
-            some = rows[objects.scene[rows] == scene]
-            poses = objects.rotation[some], objects.translation[some]
-            overlaps = self._overlaps(objects.category[some], *poses, objects.fixed[some])
-            if overlaps is None:
-                unmeasured.append(scene)
-                continue
-            one, two = some[overlaps[0]], some[overlaps[1]]
-            found.append((np.minimum(one, two), np.maximum(one, two), overlaps[2]))
-        first, second, value = (np.concatenate(column) for column in zip(*found, strict=True)) if found else _NOTHING
-        keys, inverse = np.unique(first * len(objects) + second, return_inverse=True)
-        depth, total = np.zeros(len(keys)), np.zeros(len(keys))
-        np.maximum.at(depth, inverse, value)
+    def overlaps(self, objects: Objects, first: Index, second: Index) -> ObjectOverlaps:
+        """Which of the pairs ``first`` (P,), ``second`` (P,) of objects of some scenes overlap, by their fine parts."""
+        poses = objects.category, objects.rotation, objects.translation
+        one, two, value, unmeasured = self._overlaps(*poses, first, second, objects.scene)
+        keys, inverse = np.unique(one * len(objects) + two, return_inverse=True)
         order = np.lexsort((value, inverse))  # sums do not depend on the order of the contacts
-        np.add.at(total, inverse[order], value[order])
         count = np.bincount(inverse, minlength=len(keys))
-        first, second = np.divmod(keys, max(len(objects), 1))
-        return ObjectOverlaps(first, second, depth, total, count, np.array(unmeasured, dtype=np.int64))
+        total = np.bincount(inverse[order], weights=value[order], minlength=len(keys))
+        deepest = value[order][np.cumsum(count) - 1]
+        one, two = np.divmod(keys, max(len(objects), 1))
+        return ObjectOverlaps(one, two, deepest, np.asarray(total), count, unmeasured)
 
     def contacts(self, objects: Objects, pairs: ObjectPairs, fine: Mask) -> Contacts:
         """Near parts of the ``pairs`` of objects: fine parts for the pairs in ``fine`` (P,), coarse ones for others."""

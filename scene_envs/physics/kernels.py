@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.collision import TOO_MANY, corner_tests
+from scene_envs.physics.collision import TOO_MANY, corner_tests, scene_pairs
 from scene_envs.physics.engines import Course
 from scene_envs.physics.motion import Physics, motion, physics_of, settle_scene
 from scene_envs.physics.placement import Budget, ObjectPairs, Objects, flatten, object_boxes, place, simulation_units
@@ -62,10 +62,8 @@ def _start(chunk: Chunk, engine: str) -> tuple[Physics, Objects, NDArray[np.bool
 
 def _budgets(chunk: Chunk, objects: Objects, pairs: ObjectPairs) -> list[Budget]:
     """Work that the simulation of each scene may take."""
-    if chunk.units is not None:
-        return [Budget(units) for units in chunk.units.tolist()]
-    scenes = [np.flatnonzero(objects.scene == index) for index in range(len(chunk))]
-    return [Budget(simulation_units(objects[rows], pairs.among(rows))) for rows in scenes]
+    units = simulation_units(objects, pairs, len(chunk)) if chunk.units is None else chunk.units
+    return list(map(Budget, units.tolist()))
 
 
 def feasibility_kernel(
@@ -119,26 +117,25 @@ def equilibrium_kernel(chunk: Chunk, *, engine: str, duration: float) -> dict[st
 def penetration_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
     """See :func:`scene_envs.physics.penetration`."""
     physics, objects, valid = _start(chunk, engine)
-    found = physics.collider.overlaps(objects)
+    found = physics.collider.overlaps(objects, *scene_pairs(objects))
+    scene, slots = objects.scene[found.first], (objects.slot[found.first], objects.slot[found.second])
     work = corner_tests(physics.library, objects, found.first, found.second)
-    tests = np.bincount(objects.scene[found.first], weights=work, minlength=len(chunk))
-    valid[tests > TOO_MANY] = False
+    valid[np.bincount(scene, weights=work, minlength=len(chunk)) > TOO_MANY] = False
     valid[found.unmeasured] = False
     if not valid.all():
         _LOGGER.warning("objects of a scene overlap too much to be measured one by one; its row is invalid")
     listed: list[list[tuple[int, int, float, float, int]]] = [[] for _ in range(len(chunk))]
-    deepest = np.zeros(len(objects))
-    for a, b, depth, total, count in zip(
-        found.first, found.second, found.depth, found.total, found.part_count, strict=True
-    ):
-        slots = int(objects.slot[a]), int(objects.slot[b])
-        listed[objects.scene[a]].append((*slots, float(depth), float(total), int(count)))
-        deepest[[a, b]] = np.maximum(deepest[[a, b]], depth)
+    columns = (values.tolist() for values in (*slots, found.depth, found.total, found.part_count))
+    for index, pair in zip(scene.tolist(), zip(*columns, strict=True), strict=True):
+        listed[index].append(pair)
+    deepest = np.zeros(chunk.categories.shape)
+    for slot in slots:
+        np.maximum.at(deepest, (scene, slot), found.depth)
     return {
         "pairs": listed,
-        "depth": _scatter(chunk, objects, deepest),
-        "total_per_pair": np.array([sum(entry[2] for entry in scene) for scene in listed]),
-        "total_per_geometry": np.array([sum(entry[3] for entry in scene) for scene in listed]),
+        "depth": deepest,
+        "total_per_pair": np.bincount(scene, weights=found.depth, minlength=len(chunk)),
+        "total_per_geometry": np.bincount(scene, weights=found.total, minlength=len(chunk)),
         "valid": valid,
     }
 
@@ -249,12 +246,11 @@ def projection_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
 
 def units_kernel(chunk: Chunk, *, engine: str) -> dict[str, Any]:
     """Units of simulation that each scene may spend; 0 for heaps, which are not simulated."""
-    units = np.zeros(len(chunk))
-    for index in range(len(chunk)):
-        physics, objects, _ = _start(chunk[index : index + 1], engine)
-        if not heaps(physics.collider, objects).any():
-            units[index] = simulation_units(objects, physics.collider.pairs(objects))
-    return {"units": units, "valid": np.ones(len(chunk), dtype=bool)}
+    physics, objects, valid = _start(chunk, engine)
+    spread = np.array([bool(heaps(physics.collider, objects[objects.scene == row]).any()) for row in range(len(chunk))])
+    objects = objects[~spread[objects.scene]]
+    units = simulation_units(objects, physics.collider.pairs(objects), len(chunk))
+    return {"units": np.where(spread, 0.0, units), "valid": valid}
 
 
 def _scatter(chunk: Chunk, objects: Objects, values: NDArray[Any]) -> NDArray[Any]:

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.collision import Collider
+from scene_envs.physics.collision import Collider, scene_pairs
 from scene_envs.physics.engines import Course, Engine, Moved
 from scene_envs.physics.mujoco import MujocoEngine
 from scene_envs.physics.parts import GRAVITY, LibraryGeometry, library_geometry
@@ -108,6 +108,12 @@ def motion(
     which gravity is tilted in simulations.
     """
     rest = physics.rest(objects, pairs, duration)
+    if tilt == (0.0, 0.0):
+        way, units = physics.engine.fall(duration)
+        loose, struck = _falls(objects, pairs, rest, way)
+        for scene in objects.scene[loose]:
+            budgets[scene].spent += units
+        rest = Rest((rest.still | loose) & ~struck, np.where(loose, -way, rest.rise), rest.tilt)
     displacement, rotation = np.abs(rest.rise), rest.tilt.copy()
     lost: list[int] = []
     for scene in np.unique(objects.scene[~(rest.still | objects.fixed)]):
@@ -122,6 +128,35 @@ def motion(
     displacement[objects.fixed] = 0.0
     rotation[objects.fixed] = 0.0
     return displacement, rotation, np.array(lost, dtype=np.int64)
+
+
+def _falls(objects: Objects, pairs: ObjectPairs, rest: Rest, way: float) -> tuple[Mask, Mask]:
+    """(n,) objects of some scenes that fall freely by ``way`` (m) and meet nothing, and (n,) objects at rest onto which
+    others fall.
+    """
+    falling = ~(rest.still | objects.fixed)
+    _spread(falling, pairs.first, pairs.second)
+    loose, struck = falling.copy(), np.zeros(len(objects), dtype=bool)
+    if not falling.any():
+        return loose, struck
+    touching = pairs.depth > 0
+    loose[pairs.first[touching]] = loose[pairs.second[touching]] = False
+    _spread(loose, pairs.first, pairs.second)
+    first, second = scene_pairs(objects)
+    first, second = (rows[falling[first] | falling[second]] for rows in (first, second))
+    low = pairs.low - _MARGIN
+    low[falling, 2] -= way
+    met = ((low[first] <= pairs.high[second]) & (low[second] <= pairs.high[first])).all(axis=1)
+    first, second = first[met], second[met]
+    struck[first[~falling[first]]] = struck[second[~falling[second]]] = True
+    _spread(loose, first, second)
+    return loose, struck & rest.still
+
+
+def _spread(chosen: Mask, first: Index, second: Index) -> None:
+    """Remove from ``chosen`` (n,), in place, all that are linked to others by pairs (P,), (P,)."""
+    while (lost := chosen[first] != chosen[second]).any():
+        chosen[first[lost]] = chosen[second[lost]] = False
 
 
 def advance(

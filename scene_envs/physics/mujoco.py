@@ -6,6 +6,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import mujoco
@@ -13,17 +14,18 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from scene_envs.arrays import Array, Index, Mask, ranges
-from scene_envs.physics.engines import DAMPING, Course, Moved, gravity
+from scene_envs.physics.engines import DAMPING, Course, Moved, fallen, gravity
 from scene_envs.physics.parts import (
     FRICTION,
     LibraryGeometry,
     angle_between,
     apply,
     matrices,
+    padded,
     quaternions,
     times,
 )
-from scene_envs.physics.placement import Objects, components
+from scene_envs.physics.placement import Objects
 
 TIMESTEP = 0.002
 """Length of a step, s, also in exported MJCF files."""
@@ -55,12 +57,21 @@ the depth: the true depth is between the two."""
 _ARENA, _ROOMS = 1 << 19, (1, 16)
 """Bytes for the contacts of each body of a model, at least for eight; where they do not suffice, the work is done again
 with a model of more room."""
-_GROUP = 32
-"""Bodies that are asked for their overlaps together: models for many more are slow."""
+_PAIRS = 512
+"""Pairs of parts that MuJoCo measures together."""
+_CONTACT_BYTES, _SEARCH_BYTES = 1 << 10, 1 << 23
+"""Memory for the contact of a pair, and for the search for its depth."""
+_CORNERS = (8, 16, 32)
+"""Numbers of corners up to which parts share padded arrays."""
+_BLOCK = 1 << 16
+"""Pairs of parts whose boxes are compared together."""
 _TOO_MANY = 600_000
-"""Pairs of parts of one scene above which overlaps are not measured: they would take more than a second."""
+"""Pairs of parts of one scene in the common boxes of their bodies above which overlaps are not measured: they may take
+more than a second."""
 Sizes = tuple[int, int, int, int]
 """Free bodies, geometries of each, fixed bodies, geometries of each."""
+_FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
+_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BADQ{name}")) for name in ("POS", "VEL", "ACC")]
 _GEOMETRY = ("geom_dataid", "geom_pos", "geom_quat", "geom_size", "geom_aabb", "geom_rbound")
 _NODE = ("bvh_aabb", "bvh_child", "bvh_depth", "bvh_nodeid")
 
@@ -78,11 +89,11 @@ class _Models:
     """Models with places for bodies of given kinds, and what each kind puts into its place."""
 
     def __init__(self, parts: Sequence[Array], bodies: Sequence[_Body]) -> None:
-        self._parts = [_solid(corners).ravel().tolist() for corners in parts]
+        self._parts = parts
         self._stages: dict[tuple[Sizes, int], _Stage] = {}
-        spec = self._spec()
+        spec = scene_spec(parts)
         for body in bodies:
-            self._add(spec, body.parts, body.translation, np.roll(quaternions(body.rotation[None])[0], 1))
+            add_parts(_add_body(spec), body.parts, body.translation, np.roll(quaternions(body.rotation[None])[0], 1))
         model = spec.compile()
         self.geometries = {name: getattr(model, name).copy() for name in _GEOMETRY}
         self.first, self.count = model.body_geomadr[1:].astype(np.int64), model.body_geomnum[1:].astype(np.int64)
@@ -92,32 +103,17 @@ class _Models:
         owner = np.repeat(np.arange(len(bodies)), self.tree)
         self.nodes["bvh_nodeid"][: len(owner)] -= np.where(leaf[: len(owner)], self.first[owner], 0)
 
-    def _spec(self) -> Any:
-        spec = mujoco.MjSpec()
-        option = spec.option
-        option.timestep, option.impratio = TIMESTEP, 10.0
-        option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
-        for index, corners in enumerate(self._parts):
-            spec.add_mesh(name=f"part{index}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL, uservert=corners)
-        return spec
-
-    @staticmethod
-    def _add(spec: Any, parts: Sequence[int], position: Any = (0, 0, 0), quaternion: Any = (1, 0, 0, 0)) -> Any:
-        body = spec.worldbody.add_body(mass=1.0, inertia=(1.0, 1.0, 1.0), explicitinertial=True)
-        for part in parts:
-            geometry = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{part}")
-            geometry.pos, geometry.quat = position, quaternion
-            geometry.friction[0] = FRICTION
-            geometry.solref[:], geometry.solimp[:] = SOLREF, SOLIMP
-        return body
-
     def compile(self, sizes: Sizes, room: int) -> Any:
         """A model with places for bodies of ``sizes``."""
-        spec = self._spec()
+        spec = scene_spec(self._parts)
+        # a row of a contact has twelve numbers at most: sparse rows are a tenth to a quarter faster from two bodies on
+        spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
         spec.memory = room * _ARENA * max(8, sizes[0])
         for free, bodies, geometries in ((True, *sizes[:2]), (False, *sizes[2:])):
             for _ in range(bodies):
-                body = self._add(spec, [0] * geometries)
+                body = _add_body(spec)
+                add_parts(body, [0] * geometries)
                 if free:
                     body.add_freejoint()
         return spec.compile()
@@ -142,6 +138,7 @@ class _Stage:
         self.model = models.compile(sizes, room)
         self.data = mujoco.MjData(self.model)
         self.model.geom_sameframe[:] = 0
+        self._warnings = self.data.warning.number  # a view
         self._fields = {name: getattr(self.model, name) for name in (*_GEOMETRY, *_NODE)}  # views of the model's arrays
         self._first, self._root = self.model.body_geomadr.astype(np.int64), self.model.body_bvhadr.astype(np.int64)
         self._idle = np.zeros((sizes[0], 7))
@@ -192,14 +189,12 @@ class _Stage:
     @property
     def is_full(self) -> bool:
         """Whether contacts were left out for want of room."""
-        full = mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL
-        return any(self.data.warning[index].number for index in full)
+        return bool(self._warnings[_FULL].any())
 
     @property
     def is_lost(self) -> bool:
         """Whether the simulation diverged."""
-        bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-        return any(self.data.warning[index].number for index in bad)
+        return bool(self._warnings[_BAD].any())
 
     def run(self, count: int, duration: float, course: Course) -> Array:
         """Positions and orientations (count, 7) of the first free bodies at the end of a simulation, or at rest."""
@@ -217,25 +212,32 @@ class _Stage:
                 velocity *= (1.0 - DAMPING) ** (ahead * TIMESTEP)
         return data.qpos.reshape(-1, 7)[:count].copy()  # type: ignore[no-any-return]
 
-    def overlaps(self) -> tuple[Index, Index, Array, Array] | None:
-        """Bodies (Q, 2) and parts (Q, 2) of each pair of overlapping geometries, depth (Q,) m and normal (Q, 3) from
-        the first to the second; None where there are too many.
-        """
-        model, data = self.model, self.data
-        option = model.opt
-        flags, iterations = option.disableflags, option.ccd_iterations
-        option.disableflags, option.ccd_iterations = flags | mujoco.mjtDisableBit.mjDSBL_MULTICCD, _ITERATIONS
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
-        option.disableflags, option.ccd_iterations = flags, iterations
-        if self.is_full:
-            return None
-        contact = data.contact
-        geometry, inside = contact.geom.astype(np.int64), contact.dist < 0
-        geometry = geometry[inside]
-        bodies, parts = model.geom_bodyid[geometry].astype(np.int64), model.geom_dataid[geometry].astype(np.int64)
-        return bodies, parts, -contact.dist[inside], contact.frame[inside, :3]
+
+def scene_spec(parts: Sequence[Array]) -> Any:
+    """A specification with the settings of exported files and meshes "part0", "part1", ... of the corners (V, 3) m of
+    parts.
+    """
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep, option.impratio = TIMESTEP, 10.0
+    option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
+    for index, corners in enumerate(parts):
+        vertices = _solid(corners).ravel().tolist()
+        spec.add_mesh(name=f"part{index}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL, uservert=vertices)
+    return spec
+
+
+def _add_body(spec: Any) -> Any:
+    return spec.worldbody.add_body(mass=1.0, inertia=(1.0, 1.0, 1.0), explicitinertial=True)
+
+
+def add_parts(body: Any, parts: Sequence[int], position: Any = (0, 0, 0), quaternion: Any = (1, 0, 0, 0)) -> None:
+    """Add geometries of some parts of a specification to a body, with the contacts of exported files."""
+    for part in parts:
+        geometry = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{part}")
+        geometry.pos, geometry.quat = position, quaternion
+        geometry.friction[0] = FRICTION
+        geometry.solref[:], geometry.solimp[:] = SOLREF, SOLIMP
 
 
 def _solid(corners: Array) -> Array:
@@ -250,63 +252,126 @@ class Overlaps:
     """Exact overlaps of bodies, each a set of convex parts, from the corners (V, 3) m of all parts and the numbers of
     the parts of each kind of body; corners inside the hull of a part are ignored.
 
-    A depth is wrong by less than 4 µm, and in nearly all cases by less than 0.1 µm (benchmarks/narrowphase.py).
+    A depth is wrong by less than 4 µm, and in nearly all cases by less than 0.1 µm (benchmarks/narrowphase.py). It
+    depends on the two bodies alone, and on those that coincide with one of them.
 
     >>> cube = np.array([(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
     >>> overlaps = Overlaps([cube], [[0]])
     >>> apart = np.array([(0.0, 0.0, 0.0), (0.2, 0.0, 0.9)])
-    >>> first, second, depth = overlaps(np.array([0, 0]), np.eye(3)[None].repeat(2, 0), apart)
+    >>> poses = np.array([0, 0]), np.eye(3)[None].repeat(2, 0), apart
+    >>> first, second, depth, _ = overlaps(*poses, np.array([0]), np.array([1]))
     >>> first.tolist(), second.tolist(), depth.round(6).tolist()
     ([0], [1], [0.1])
     """
 
     def __init__(self, parts: Sequence[Array], bodies: Sequence[Sequence[int]]) -> None:
-        self._models = _Models(parts, [_Body(ids, np.eye(3), np.zeros(3)) for ids in bodies])
-        self._parts = parts
-        corners = [np.concatenate([parts[index] for index in ids]) for ids in bodies]
-        self._middle = np.stack([0.5 * (some.min(axis=0) + some.max(axis=0)) for some in corners])  # (K, 3) m
-        spread = zip(corners, self._middle, strict=True)
-        self._radius = np.array([np.linalg.norm(some - middle, axis=1).max() for some, middle in spread])  # (K,) m
-        most = max(map(len, parts))
-        self._corners = np.stack([np.resize(corners, (most, 3)) for corners in parts])  # (P, V, 3) m
-        self._lock = threading.Lock()
+        self._parts, self._lock = parts, threading.Lock()
+        self._count = np.array([len(ids) for ids in bodies])
+        self._first, self._part = np.cumsum(self._count) - self._count, np.concatenate(bodies).astype(np.int64)
+        spec = scene_spec(parts)
+        spec.option.ccd_iterations, spec.option.disableflags = _ITERATIONS, mujoco.mjtDisableBit.mjDSBL_MULTICCD
+        spec.memory = _PAIRS * _CONTACT_BYTES + _SEARCH_BYTES
+        _add_body(spec)  # or there are no contacts
+        for index in range(max(2 * _PAIRS, len(parts))):
+            geometry = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, name=f"{index}", contype=0)
+            geometry.meshname, geometry.conaffinity = f"part{index % len(parts)}", 0
+        for index in range(_PAIRS):
+            spec.add_pair(geomname1=f"{2 * index}", geomname2=f"{2 * index + 1}")
+        self._model = model = spec.compile()
+        self._data = mujoco.MjData(model)
+        count = len(parts)
+        self._position, self._radius = model.geom_pos[:count].copy(), model.geom_rbound[:count].copy()
+        self._rotation = matrices(np.roll(model.geom_quat[:count], -1, axis=1))
+        box = model.geom_aabb[:count]
+        self._middle = self._position + apply(self._rotation, box[:, :3])  # (P, 3) m, of the box of each part
+        self._axes = self._rotation * (box[:, None, 3:] + 2.0 * _SAME)  # (P, 3, 3) m, its half axes, columns
+        sizes = np.array([len(corners) for corners in parts])
+        self._size, self._row = np.searchsorted(_CORNERS, sizes), np.zeros(count, dtype=np.int64)
+        self._corners: dict[int, Array] = {}  # (members, V, 3) m, of the parts of each size
+        for size in np.unique(self._size).tolist():
+            members = np.flatnonzero(self._size == size)
+            self._row[members] = np.arange(len(members))
+            self._corners[size] = padded([parts[index] for index in members.tolist()])
 
     def __call__(
-        self, kind: Index, rotation: Array, translation: Array, fixed: Mask | None = None
-    ) -> tuple[Index, Index, Array] | None:
-        """Rows (Q,), (Q,) of the bodies of each overlapping pair of parts, the smaller first, and its depth (Q,) m.
+        self, kind: Index, rotation: Array, translation: Array, first: Index, second: Index, scene: Index | None = None
+    ) -> tuple[Index, Index, Array, Index]:
+        """Rows (Q,), (Q,) of the bodies of each overlapping pair of parts and its depth (Q,) m, and the scenes in which
+        these pairs are too many, of which none is listed.
 
-        Bodies of a ``kind`` (n,) are at ``rotation`` (n, 3, 3) and ``translation`` (n, 3) m, all finite. Two ``fixed``
-        (n,) ones are no pair. None where the pairs are too many.
+        Bodies of a ``kind`` (n,) are at ``rotation`` (n, 3, 3) and ``translation`` (n, 3) m, all finite, in one scene
+        or in that of the number ``scene`` (n,). The pairs of bodies in question are ``first`` (P,) and ``second`` (P,).
         """
-        fixed = np.zeros(len(kind), dtype=bool) if fixed is None else fixed
-        middle, radius = translation + apply(rotation, self._middle[kind]), self._radius[kind]  # bounding spheres
-        first, second = np.triu_indices(len(kind), k=1)
-        apart = ((middle[first] - middle[second]) ** 2).sum(axis=1)
-        near = (apart < (radius[first] + radius[second]) ** 2) & ~(fixed[first] & fixed[second])
-        first, second = first[near], second[near]
-        if (self._models.count[kind[first]] * self._models.count[kind[second]]).sum() > _TOO_MANY:
-            return None
-        position, quaternion = translation + _aside(kind, translation), np.roll(quaternions(rotation), 1, axis=1)
-        bodies: list[Index] = [np.empty((0, 2), dtype=np.int64)]
-        depths: list[Array] = [np.empty(0)]
-        for some in _groups(fixed, first, second):
-            found = None
-            for room in _ROOMS:
-                with self._lock:
-                    stage = self._models.stage(kind[some], fixed[some], room)
-                    rows = stage.place(kind[some], fixed[some], position[some], quaternion[some])
-                    found = stage.overlaps()
-                if found is not None:
-                    break
-            if found is None:
-                return None
-            body = some[rows[found[0]]]
-            bodies.append(body)
-            depths.append(self._certain(found[1], rotation[body], translation[body], *found[2:]))
-        body, depth = np.concatenate(bodies), np.concatenate(depths)
+        scene = np.zeros(len(kind), dtype=np.int64) if scene is None else scene
+        if not len(first):
+            return first, second, np.empty(0), first
+        owner, item = ranges(self._first[kind], self._count[kind])
+        part = self._part[item]
+        turn = rotation[owner]
+        x, y, z = np.moveaxis(np.abs(turn @ self._axes[part]), 2, 0)
+        half, middle = x + y + z, translation[owner] + apply(turn, self._middle[part])
+        low, high, start = middle - half, middle + half, np.cumsum(self._count[kind]) - self._count[kind]
+        whole_low, whole_high = np.minimum.reduceat(low, start), np.maximum.reduceat(high, start)
+        near = _meet(whole_low, whole_high, whole_low, whole_high, first, second)
+        order = np.lexsort((*translation.T, kind, scene))
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        swap = rank[first[near]] > rank[second[near]]  # which part is MuJoCo's first does not depend on slots
+        first, second = np.where(swap, second[near], first[near]), np.where(swap, first[near], second[near])
+        common_low = np.maximum(whole_low[first], whole_low[second])
+        common_high = np.minimum(whole_high[first], whole_high[second])
+        sides = []
+        for body in (first, second):  # parts in the box that is common to both bodies
+            pair, one = ranges(start[body], self._count[kind[body]])
+            inside = _meet(low, high, common_low, common_high, one, pair)
+            sides.append((one[inside], np.bincount(pair[inside], minlength=len(first))))
+        (ones, count), (others, other_count) = sides
+        products = count * other_count
+        lost = np.flatnonzero(np.bincount(scene[first], weights=products) > _TOO_MANY)
+        products[np.isin(scene[first], lost)] = 0
+        begin, other_begin = np.cumsum(count) - count, np.cumsum(other_count) - other_count
+        found: list[tuple[Index, Index]] = [(np.empty(0, dtype=np.int64),) * 2]
+        for rows in _blocks(products):
+            pair, number = ranges(np.zeros_like(products[rows]), products[rows])
+            row, column = np.divmod(number, other_count[rows][pair])
+            one, other = ones[begin[rows][pair] + row], others[other_begin[rows][pair] + column]
+            met = _meet(low, high, low, high, one, other)
+            found.append((one[met], other[met]))
+        both = np.stack([np.concatenate(column) for column in zip(*found, strict=True)], axis=1)
+        body, part = owner[both], part[both]  # (Q, 2)
+        aside = translation + _aside(kind, translation, scene)
+        row, depth, normal = self._contacts(part, rotation[body], aside[body])
+        body = body[row]
+        depth = self._certain(part[row], rotation[body], translation[body], depth, normal)
         body, depth = body[depth > _ROUNDING], depth[depth > _ROUNDING]
-        return body.min(axis=1), body.max(axis=1), depth
+        return body.min(axis=1), body.max(axis=1), depth, lost
+
+    def _contacts(self, part: Index, rotation: Array, translation: Array) -> tuple[Index, Array, Array]:
+        """Rows (C,) of the pairs of parts (Q, 2) at rotations (Q, 2, 3, 3) and translations (Q, 2, 3) m between which
+        MuJoCo finds a contact, its depth (C,) m, and its normal (C, 3) from the first to the second.
+        """
+        model, data = self._model, self._data
+        position = translation + apply(rotation, self._position[part])
+        turn = (rotation @ self._rotation[part]).reshape(-1, 9)
+        contacts = []
+        for first in range(0, len(part), _PAIRS):
+            rows = slice(first, first + _PAIRS)
+            count = 2 * len(part[rows])
+            with self._lock:
+                model.geom_dataid[:count] = part[rows].ravel()
+                model.geom_rbound[:count] = self._radius[part[rows]].ravel()
+                data.geom_xpos[:count] = position[rows].reshape(-1, 3)
+                data.geom_xpos[count:, 0] = _FAR * np.arange(len(data.geom_xpos) - count)
+                data.geom_xmat[:count] = turn[2 * first : 2 * first + count]
+                mujoco.mj_collision(model, data)
+                contact = data.contact
+                row, distance, normal = contact.geom[:, 0] // 2, contact.dist.copy(), contact.frame[:, :3].copy()
+            inside = distance < 0
+            contacts.append((first + row[inside].astype(np.int64), -distance[inside], normal[inside]))
+        if not contacts:
+            return np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, 3))
+        row, depth, normal = (np.concatenate(column) for column in zip(*contacts, strict=True))
+        return row, depth, normal
 
     def _certain(self, part: Index, rotation: Array, translation: Array, depth: Array, normal: Array) -> Array:
         """Exact depth (Q,) m of pairs of parts (Q, 2) at rotations (Q, 2, 3, 3) and translations (Q, 2, 3) m.
@@ -315,14 +380,15 @@ class Overlaps:
         along its ``normal`` (Q, 3) is the true depth or more; where the two differ, the depth is computed from the hull
         of all differences of corners.
         """
-        far, near = (
-            np.einsum(
-                "qvi,qi->qv", self._corners[part[:, side]], np.einsum("qij,qi->qj", rotation[:, side], sign * normal)
-            )
-            for side, sign in ((0, 1.0), (1, -1.0))
-        )
-        apart = np.einsum("qi,qi->q", translation[:, 1] - translation[:, 0], normal)
-        width = far.max(axis=1) + near.max(axis=1) - apart
+        x, y, z = ((translation[:, 0] - translation[:, 1]) * normal).T
+        width = x + y + z
+        for side, sign in ((0, 1.0), (1, -1.0)):
+            along = apply(rotation[:, side].swapaxes(1, 2), sign * normal)
+            sizes = self._size[part[:, side]]
+            for size, corners in self._corners.items():
+                some = np.flatnonzero(sizes == size)
+                reach = corners[self._row[part[some, side]]] @ along[some, :, None]
+                width[some] += reach.max(axis=1)[:, 0]
         for row in np.flatnonzero(~(np.abs(width - depth) <= _CERTAIN)):
             turn = rotation[row, 0].T
             one, other = (self._parts[index] for index in part[row])
@@ -335,37 +401,31 @@ class Overlaps:
         return np.maximum(width, 0.0)  # type: ignore[no-any-return]
 
 
-def _groups(fixed: Mask, first: Index, second: Index) -> list[Index]:
-    """Bodies of each group: about ``_GROUP`` of those that are not ``fixed`` (n,), with all bodies near them. Bodies
-    near each other are given as pairs (P,), (P,).
-    """
-    both = ~(fixed[first] | fixed[second])
-    component = components(len(fixed), first[both], second[both])
-    near = np.zeros(len(fixed), dtype=bool)
-    near[first] = near[second] = True
-    free = np.flatnonzero(near & ~fixed)
-    sizes = np.bincount(component[free], minlength=len(fixed))
-    group = ((np.cumsum(sizes) - sizes) // _GROUP)[component]
-    groups = []
-    for number in np.unique(group[free]):
-        chosen = np.zeros(len(fixed), dtype=bool)
-        chosen[free[group[free] == number]] = True
-        beside = chosen.copy()
-        beside[second[chosen[first]]] = beside[first[chosen[second]]] = True
-        groups.append(np.flatnonzero(beside))
-    return groups
+def _meet(low: Array, high: Array, other_low: Array, other_high: Array, one: Index, other: Index) -> Mask:
+    """(P,) whether the boxes ``one`` (P,) of some and ``other`` (P,) of others meet."""
+    meets = (low[one, 0] <= other_high[other, 0]) & (other_low[other, 0] <= high[one, 0])
+    for axis in (1, 2):
+        meets &= (low[one, axis] <= other_high[other, axis]) & (other_low[other, axis] <= high[one, axis])
+    return meets
 
 
-def _aside(kind: Index, position: Array) -> Array:
+def _blocks(counts: Index) -> list[slice]:
+    """Slices of rows whose ``counts`` (P,) are together about ``_BLOCK``."""
+    number = np.cumsum(counts) // _BLOCK
+    edges = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(counts)]
+    return [slice(*edge) for edge in pairwise(edges)]
+
+
+def _aside(kind: Index, position: Array, scene: Index) -> Array:
     """(n, 3) m, moves of up to ``_SAME`` that depend on the ``kind`` (n,) and ``position`` (n, 3) m of each body alone,
-    and on its number among bodies that coincide.
+    and on its number among bodies that coincide in its ``scene`` (n,).
     """
     steps = np.array([0.6180339887, 0.7548776662, 0.8191725134])
     order = np.lexsort((*position.T, kind))
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     rank = np.zeros(len(order), dtype=np.int64)  # larger than that of all coinciding bodies before it
-    near = cKDTree(position).query_pairs(_SAME, p=np.inf, output_type="ndarray")
+    near = cKDTree(np.c_[position, scene]).query_pairs(_SAME, p=np.inf, output_type="ndarray")
     for one, other in sorted(np.sort(place[near], axis=1).tolist()):
         rank[other] = max(rank[other], rank[one] + 1)
     return _SAME * np.modf((1.0 + kind + 0.37 * rank[place])[:, None] * steps + np.abs(1e3 * position))[0]  # type: ignore[no-any-return]
@@ -406,7 +466,7 @@ class MujocoEngine:
             budget = replace(course.budget)
             with self._lock:
                 stage = self._models.stage(kind, some.fixed, room)
-                stage.place(kind, some.fixed, position, np.roll(start, 1, axis=1))
+                stage.place(kind, some.fixed, position, start[:, [3, 0, 1, 2]])
                 stage.weigh(self._library.mass[category], self._library.moments[category])
                 end = stage.run(count, duration, replace(course, budget=budget))
                 lost = stage.is_full or stage.is_lost
@@ -414,8 +474,13 @@ class MujocoEngine:
                 break
         course.budget.spent = budget.spent
         rotation, translation, angle = cluster.rotation.copy(), cluster.translation.copy(), np.zeros(len(order))
-        rows, after = order[:count], np.roll(end[:, 3:], -1, axis=1)
+        rows, after = order[:count], end[:, [4, 5, 6, 3]]
         rotation[rows] = times(matrices(after), self._library.axes[category].swapaxes(1, 2))
         translation[rows] = np.nan if lost else end[:, :3] - apply(rotation[rows], center[category])
         angle[rows] = angle_between(start[:count], after)
         return Moved(rotation, translation, angle)
+
+    def fall(self, duration: float) -> tuple[float, float]:
+        """See :class:`~scene_envs.physics.engines.Engine`."""
+        steps = max(1, round(duration / TIMESTEP))
+        return fallen(steps, TIMESTEP), steps

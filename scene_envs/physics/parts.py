@@ -292,7 +292,9 @@ def matrices(xyzw: Array) -> Array:
 def angle_between(a: Array, b: Array) -> Array:
     """Angle (n,) between unit quaternions (x, y, z, w), accurate when tiny."""
     scalar = np.abs((a * b).sum(axis=1))
-    vector = a[:, 3:] * b[:, :3] - b[:, 3:] * a[:, :3] - np.cross(a[:, :3], b[:, :3])
+    (x, y, z), (u, v, w) = a[:, :3].T, b[:, :3].T
+    cross = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
+    vector = a[:, 3:] * b[:, :3] - b[:, 3:] * a[:, :3] - cross
     return 2.0 * np.arctan2(np.linalg.norm(vector, axis=1), scalar)
 
 
@@ -315,4 +317,4 @@ class Rows:
         return type(self)(*(np.concatenate(pair) for pair in zip(self._columns(), other._columns(), strict=True)))
 
     def _columns(self) -> list[Any]:
-        return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
+        return [getattr(self, name) for name in self.__dataclass_fields__]  # type: ignore[attr-defined]

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask, ranges
-from scene_envs.physics.parts import SIZE_CLASSES, LevelGeometry, LibraryGeometry, PartTable, Rows, apply, times
+from scene_envs.physics.parts import SIZE_CLASSES, LibraryGeometry, PartTable, Rows, apply, times
 
 _CLASSES = len(SIZE_CLASSES) + 1
 _BLOCK = 1 << 16
@@ -100,7 +100,7 @@ def _best_face_gap(
 ) -> tuple[Array, Array]:
     """Best face of the owner: (P,) gap and (P, 3) world normal; ``shift`` leads to the other part."""
     inverse = other.swapaxes(-1, -2)
-    seen = apply(times(inverse, rotation)[:, None], normals)  # (P, K, 3) in the other's frame
+    seen = normals @ times(inverse, rotation).swapaxes(1, 2)  # (P, K, 3) in the other's frame
     away = apply(inverse, shift)
     gaps = _lowest(seen, vertices) + _along(seen, away) - offsets
     best = gaps.argmax(axis=1)
@@ -112,17 +112,13 @@ def _face_gaps(
     normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
 ) -> tuple[Array, Array]:
     """Every face of the owner: (P, K) gaps and (P, K, 3) world normals."""
-    world = apply(rotation[:, None], normals)
-    seen = apply(other.swapaxes(-1, -2)[:, None], world)
-    return _lowest(seen, vertices) + _along(world, shift) - offsets, world
+    world = normals @ rotation.swapaxes(1, 2)
+    return _lowest(world @ other, vertices) + _along(world, shift) - offsets, world
 
 
 def _lowest(directions: Array, vertices: Array) -> Array:
     """(P, K) m: least height of vertices (P, V, 3) along directions (P, K, 3) of the same frame."""
-    height = directions[:, :, None, 0] * vertices[:, None, :, 0]
-    height += directions[:, :, None, 1] * vertices[:, None, :, 1]
-    height += directions[:, :, None, 2] * vertices[:, None, :, 2]
-    return height.min(axis=2)  # type: ignore[no-any-return]
+    return (vertices @ directions.swapaxes(1, 2)).min(axis=1)  # type: ignore[no-any-return]
 
 
 def _along(directions: Array, vector: Array) -> Array:
@@ -169,24 +165,17 @@ class PlacedObjects:
 
 def place(library: LibraryGeometry, objects: Objects, level: Level) -> PlacedObjects:
     """Put the parts of ``objects`` into the world."""
-    levels: list[LevelGeometry] = [getattr(asset, level) for asset in library.assets]
-    counts = np.array([len(geometry.parts) for geometry in levels], dtype=np.int64)
-    count = counts[objects.category]
-    start = np.cumsum(count) - count
-    total = int(count.sum())
-    part = np.empty(total, dtype=np.int64)
-    low, high = np.empty((total, 3)), np.empty((total, 3))
-    for category in np.unique(objects.category):
-        rows = np.flatnonzero(objects.category == category)
-        geometry = levels[category]
-        target = start[rows][:, None] + np.arange(counts[category])
-        world = apply(objects.rotation[rows][:, None], geometry.vertices) + objects.translation[rows][:, None]
-        part[target] = geometry.ids
-        low[target] = np.minimum.reduceat(world, geometry.starts, axis=1)
-        high[target] = np.maximum.reduceat(world, geometry.starts, axis=1)
-    owner = np.repeat(np.arange(len(objects)), count)
+    ids = [getattr(asset, level).ids for asset in library.assets]
+    first, counts = (np.array(values)[objects.category] for values in ([i[0] for i in ids], [len(i) for i in ids]))
+    owner, part = ranges(first, counts)
     parts = PlacedParts(part, objects.rotation[owner], objects.translation[owner])
-    return PlacedObjects(parts, start, count, low, high)
+    low, high, classes = np.empty((len(part), 3)), np.empty((len(part), 3)), library.size_class[part]
+    for size, table in library.tables.items():
+        rows = np.flatnonzero(classes == size)
+        corners = parts.rotation[rows] @ table.vertices[library.row[part[rows]]].swapaxes(1, 2)
+        low[rows], high[rows] = corners.min(axis=2), corners.max(axis=2)
+    start = np.cumsum(counts) - counts
+    return PlacedObjects(parts, start, counts, low + parts.translation, high + parts.translation)
 
 
 def object_boxes(placed: PlacedObjects) -> tuple[Array, Array]:
@@ -272,8 +261,8 @@ class Budget:
         return self.spent >= self.limit
 
 
-def simulation_units(objects: Objects, pairs: ObjectPairs) -> float:
-    """Units of simulation that one scene, given as its objects and their near pairs, may take."""
+def simulation_units(objects: Objects, pairs: ObjectPairs, count: int) -> Array:
+    """(count,) units of simulation that each of ``count`` scenes, given as objects and near pairs, may take."""
     first, second = pairs.first, pairs.second
     low = np.maximum(pairs.low[first], pairs.low[second])
     high = np.minimum(pairs.high[first], pairs.high[second])
@@ -281,12 +270,11 @@ def simulation_units(objects: Objects, pairs: ObjectPairs) -> float:
     common = np.prod(np.maximum(high - low, 0.0), axis=1)
     close = (pairs.depth > _DEEP) | (common >= _COINCIDENT * np.maximum(volume[first], volume[second]))
     close &= ~(objects.fixed[first] | objects.fixed[second])
-    crowded = np.isin(np.arange(len(objects)), np.concatenate([first[close], second[close]]))
-    free = int((~objects.fixed).sum())
-    if crowded.sum() > _CROWDED * free:
-        return PER_SCENE
-    more = PER_OBJECT * free + PER_PAIR * free * (free - 1) / 2
-    return PER_SCENE + min(max(more, MIN_UNITS), MAX_PER_OBJECT * free)
+    crowded = np.zeros(len(objects), dtype=bool)
+    crowded[first[close]] = crowded[second[close]] = True
+    crowd, free = (np.bincount(objects.scene[rows], minlength=count) for rows in (crowded, ~objects.fixed))
+    more = np.maximum(PER_OBJECT * free + PER_PAIR * free * (free - 1) / 2, MIN_UNITS)
+    return PER_SCENE + np.where(crowd > _CROWDED * free, 0.0, np.minimum(more, MAX_PER_OBJECT * free))  # type: ignore[no-any-return]
 
 
 def components(count: int, first: Index, second: Index) -> Index:

@@ -147,31 +147,6 @@ def project_objects(collider: Collider, objects: Objects, workspace: Corners) ->
     return best
 
 
-def separated(
-    collider: Collider, objects: Objects, first: Index, second: Index, workspace: Corners, cost: Array
-) -> Array:
-    """Translations (n, 3) m of one scene after one round of projection of overlapping pairs (P,) and their neighbours.
-
-    A heap of objects, which would take too much work, is not changed. ``cost`` (3,) is that of a metre along each axis
-    of the world; the cheapest way out of an overlap is taken. Translations stay in the ``workspace`` (m).
-    """
-    if not len(first) or corner_tests(collider.library, objects, first, second).sum() > _OVERLAPPING:
-        return objects.translation
-    near_first, near_second = _near_pairs(collider, objects)
-    overlapping = np.concatenate([first, second])
-    kept = np.isin(near_first, overlapping) | np.isin(near_second, overlapping)
-    # Fixed objects are always among them: boards above limit how far an object can be lifted.
-    rows = np.unique(np.concatenate([near_first[kept], near_second[kept], np.flatnonzero(objects.fixed)]))
-    some = objects[rows]
-    one, other = np.searchsorted(rows, first), np.searchsorted(rows, second)
-    near = np.searchsorted(rows, near_first[kept]), np.searchsorted(rows, near_second[kept])
-    bounds = _bounds(some.translation, some, workspace)
-    home, walls, budget = some.translation, _walls(bounds), Budget(WORK)
-    result = objects.translation.copy()
-    result[rows] = _round(collider, some, home, one, other, near, bounds, walls, {}, budget, cost)
-    return result
-
-
 def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -> Projection:
     """The nearest translations without overlap that a bounded number of rounds finds."""
     home, walls, budget = objects.translation, _walls(bounds), Budget(WORK)
@@ -218,18 +193,17 @@ def _round(
     walls: Planes,
     tried: Tried,
     budget: Budget,
-    cost: Array | None = None,
 ) -> Array:
     """The next translations: they free overlapping pairs (``first``, ``second``) and keep other ``near`` ones apart."""
     near_first, near_second = near
     extra = np.zeros((len(near_first), 3))
     if len(first):
         count = len(current)
-        moves = _minimum_translations(collider, current, first, second, bounds, tried, budget, cost)
+        moves = _minimum_translations(collider, current, first, second, bounds, tried, budget)
         place_of = np.searchsorted(near_first * count + near_second, first * count + second)
         extra[place_of] = moves
     planes = _separating_planes(collider, current, near_first, near_second, extra, home, budget)
-    return nearest(current, home, planes + walls, budget, cost)
+    return nearest(current, home, planes + walls, budget)
 
 
 def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:
@@ -344,16 +318,10 @@ def _planes_at(
     return Planes(first[pair], second[pair], direction, bound), pair, best >= -_APART
 
 
-def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget, cost: Array | None = None) -> Array:
+def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget) -> Array:
     """Translations (n, 3) nearest to ``home`` that satisfy the planes as well as possible. Groups of objects that no
-    plane connects are solved separately; ``budget`` is charged with the rows solved. ``cost`` (3,) is that of a metre
-    along each axis of the world; None means 1.
+    plane connects are solved separately; ``budget`` is charged with the rows solved.
     """
-    if cost is not None:
-        direction = planes.direction / cost
-        size = np.linalg.norm(direction, axis=1)
-        scaled = Planes(planes.first, planes.second, direction / size[:, None], planes.bound / size)
-        return nearest(objects, home * cost, scaled, budget) / cost
     result = home.copy()
     free = ~objects.fixed
     moves_first, moves_second = ((rows >= 0) & free[rows] for rows in (planes.first, planes.second))
@@ -438,11 +406,10 @@ def _minimum_translations(
     bounds: tuple[Array, Array],
     tried: Tried,
     budget: Budget,
-    cost: Array | None = None,
 ) -> Array:
     """(P, 3) m: translations that free overlapping object pairs when they are added to the offsets of the pairs.
-    Directions ``tried`` in vain cost more, and those of the result join them. ``cost`` (3,) is that of a metre along
-    each axis of the world; ``budget`` is charged with one unit per pair of parts.
+    Directions ``tried`` in vain cost more, and those of the result join them. ``budget`` is charged with one unit
+    per pair of parts.
     """
     placed = place(collider.library, objects, "fine")
     pair, a, b = part_pairs(placed, first, second)
@@ -455,8 +422,6 @@ def _minimum_translations(
     directions = _directions(len(first), pair, groups, offset, walk)
     lengths = _lengths(len(first), pair, groups, directions)
     costs = lengths * _weights(collider, objects, first, second, directions, lengths, bounds)
-    if cost is not None:
-        costs *= np.linalg.norm(directions * cost, axis=-1)
     best = np.empty(len(first), dtype=np.int64)
     for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
         before = tried.setdefault(key, [])

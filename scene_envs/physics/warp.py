@@ -17,6 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 from torch import Tensor
@@ -24,8 +25,8 @@ from torch import Tensor
 from scene_envs.arrays import Array
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.physics.engines import gravity
-from scene_envs.physics.mujoco import SOLIMP, SOLREF, TIMESTEP
-from scene_envs.physics.parts import FRICTION, library_geometry
+from scene_envs.physics.mujoco import TIMESTEP, add_parts, scene_spec
+from scene_envs.physics.parts import library_geometry
 from scene_envs.rotations import matrix_to_quaternion, quaternion_to_matrix
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
@@ -100,12 +101,12 @@ class WarpEngine:
         device = torch.device(device)
         if device.type == "cuda" and not torch.cuda.is_available():
             raise InvalidInputError(f"device {str(device)!r} was asked for, but torch finds no CUDA GPU; use 'cpu'")
-        self._mujoco, self._mjw, self._wp = _modules()
+        self._mjw, self._wp = _modules()
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self.scene_type = scene_type
         self.device = device if self._stream is None else self._stream.device
         with self._scope():
-            self._library = _Library(self._mujoco, self._mjw, scene_type, self.device)
+            self._library = _Library(self._mjw, scene_type, self.device)
         self._models: dict[Any, tuple[Any, Any]] = {}
 
     @contextmanager
@@ -127,13 +128,8 @@ class WarpEngine:
         with self._scope():
             state = _State(batch, self._library)
             scene, one, two = self._near(state)
-            feature = [
-                torch.cat(
-                    [~state.welded[scene, slot, None], state.category[scene, slot, None], state.pose[scene, slot]], 1
-                )
-                for slot in (one, two)
-            ]
-            apart = feature[0] - feature[1]  # welded first, then by category and pose: no matter which slots
+            keys = torch.cat([~state.welded[..., None], state.category[..., None], state.pose], dim=-1)
+            apart = keys[scene, one] - keys[scene, two]  # welded first, then by category and pose, not by slots
             row = (apart != 0).long().argmax(dim=1, keepdim=True)
             swap = apart.gather(1, row).squeeze(1) > 0
             one, two = torch.where(swap, two, one), torch.where(swap, one, two)
@@ -158,18 +154,18 @@ class WarpEngine:
         low, high = center - half, center + half
         count, slots = state.category.shape
         step = max(1, _PAIR_CELLS // max(1, slots * slots))
-        found = []
+        found = [torch.empty(0, 3, dtype=torch.long, device=self.device)]
         for start in range(0, count, step):
             rows = slice(start, start + step)
             meets = state.present[rows, :, None] & state.present[rows, None, :]
             meets &= ~(state.welded[rows, :, None] & state.welded[rows, None, :])
             for axis in range(3):
-                meets &= low[rows, :, None, axis] <= high[rows, None, :, axis]
-                meets &= low[rows, None, :, axis] <= high[rows, :, None, axis]
+                below = low[rows, :, None, axis] <= high[rows, None, :, axis]
+                meets &= below & below.transpose(1, 2)
             some = meets.triu(diagonal=1).nonzero()
             some[:, 0] += start
             found.append(some)
-        scene, one, two = torch.cat(found or [torch.empty(0, 3, dtype=torch.long, device=self.device)]).unbind(dim=1)
+        scene, one, two = torch.cat(found).unbind(dim=1)
         return scene, one, two
 
     def _depths(self, state: _State, scene: Tensor, one: Tensor, two: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -367,7 +363,7 @@ class WarpEngine:
         if key not in self._models:
             if len(self._models) >= _MODELS:
                 self._models.clear()
-            host = _template(self._mujoco, fixed, parts, multiple=multiple)
+            host = _template(fixed, parts, multiple=multiple)
             model = self._mjw.put_model(host)
             self._library.lend_meshes(model)
             model.opt.warn_overflow = 0
@@ -386,10 +382,9 @@ class WarpEngine:
 
 
 @cache
-def _modules() -> tuple[Any, Any, Any]:
-    """The modules mujoco, mujoco_warp and warp."""
+def _modules() -> tuple[Any, Any]:
+    """The modules mujoco_warp and warp."""
     try:
-        import mujoco
         import mujoco_warp
         import warp
     except ImportError as error:
@@ -400,7 +395,7 @@ def _modules() -> tuple[Any, Any, Any]:
         ) from error
     warp.config.log_level = warp.LOG_ERROR
     warp.init()
-    return mujoco, mujoco_warp, warp
+    return mujoco_warp, warp
 
 
 class _State:
@@ -461,15 +456,11 @@ class _Plan:
 class _Library:
     """Parts of all assets as meshes of MuJoCo, and tables (C, K, ...) of them, K the most parts of an asset."""
 
-    def __init__(self, mujoco: Any, mjw: Any, scene_type: SceneType, device: torch.device) -> None:
+    def __init__(self, mjw: Any, scene_type: SceneType, device: torch.device) -> None:
         assets = tuple(scene_type.library)
-        spec = mujoco.MjSpec()
-        for c, asset in enumerate(assets):
-            for k, part in enumerate(asset.fine):
-                name = f"{c}_{k}"
-                mesh = spec.add_mesh(name=name, uservert=np.asarray(part.vertices, dtype=np.float32).ravel())
-                mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-                spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+        parts = [part.vertices for asset in assets for part in asset.fine]
+        spec = scene_spec(parts)
+        add_parts(spec.worldbody, range(len(parts)))
         host = spec.compile()
         self._meshes = mjw.put_model(host)
         counts = [len(asset.fine) for asset in assets]
@@ -547,23 +538,18 @@ class _Library:
         model.geom_quat = wp.from_torch(take(self.inner_quaternion, 0.5), dtype=wp.quat)
 
 
-def _template(mujoco: Any, fixed: int, parts: tuple[int, ...], *, multiple: bool) -> Any:
+def _template(fixed: int, parts: tuple[int, ...], *, multiple: bool) -> Any:
     """Model of ``fixed`` mesh geometries of the world, and free bodies of ``parts`` each; ``multiple`` is several
     contacts per pair of geometries.
     """
-    spec = mujoco.MjSpec()
-    spec.option.timestep, spec.option.impratio = TIMESTEP, 10.0
-    spec.option.cone, spec.option.integrator = mujoco.mjtCone.mjCONE_ELLIPTIC, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec = scene_spec([np.concatenate([np.zeros((1, 3)), np.eye(3)])])
     if not multiple:
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
-    spec.add_mesh(name="any", uservert=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
-    bodies = [spec.worldbody.add_body(mass=1.0, inertia=[1.0, 1.0, 1.0]) for _ in parts]
-    for body in bodies:
+    add_parts(spec.worldbody, [0] * fixed)
+    for count in parts:
+        body = spec.worldbody.add_body(mass=1.0, inertia=[1.0, 1.0, 1.0], explicitinertial=True)
         body.add_freejoint()
-    for parent, count in ((spec.worldbody, fixed), *zip(bodies, parts, strict=True)):
-        for _ in range(count):
-            geom = parent.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="any", mass=0.0)
-            geom.friction, geom.solref, geom.solimp = [FRICTION, 0.005, 0.0001], SOLREF, SOLIMP
+        add_parts(body, [0] * count)
     return spec.compile()
 
 

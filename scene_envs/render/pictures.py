@@ -155,16 +155,13 @@ def gallery(
     *,
     gap: int = 8,
 ) -> Image.Image:
-    """Tile images on a white page, row by row, each with its caption below.
+    """A PIL image of a white page with images, row by row, each with its caption below.
 
     Args:
         images: One or more (H, W, 3) uint8 images of one size.
         columns: Number of images per row; fewer images than columns make one shorter row.
         captions: One line per image.
         gap: Number of pixels between images and around the page.
-
-    Returns:
-        A PIL image.
 
     Raises:
         InvalidInputError: no images, sizes that differ, or another number of captions.

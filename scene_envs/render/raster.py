@@ -72,15 +72,9 @@ class Pinhole:
 def visible_triangles(triangles: Array, camera: Pinhole) -> tuple[Index, NDArray[np.float32]]:
     """The nearest triangle through the centre of each pixel.
 
-    Triangles are seen from both sides. Two that share an edge leave no gap, and no pixel centre belongs to both.
-
-    Args:
-        triangles: (T, 3, 3) corners in the camera frame, m.
-        camera: the camera.
-
-    Returns:
-        (H, W) index of the triangle, -1 without one; and (H, W) float32 distance along the viewing direction (m), inf
-        without one.
+    Triangles, (T, 3, 3) corners in the camera frame in m, are seen from both sides. Two that share an edge leave no
+    gap, and no pixel centre belongs to both. The results are the (H, W) index of the triangle, -1 without one; and the
+    (H, W) float32 distance along the viewing direction (m), inf without one.
 
     >>> camera = Pinhole.at((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 90.0, 4, 4)
     >>> faces, depth = visible_triangles(np.array([[[-9.0, 0.0, -2.0], [9.0, 0.0, -2.0], [0.0, 9.0, -2.0]]]), camera)

@@ -293,10 +293,7 @@ def picture_camera(scene_type: str | SceneType, width: int = 480, height: int = 
     It is derived from the workspace and the fixed objects (see
     :func:`~scene_envs.render.stage.frame_scene_type`), so it also suits users' scene types.
 
-    Args:
-        scene_type: Scene type or its name.
-        width: Image width, pixels; width and height determine the distance of the camera.
-        height: Image height, pixels.
+    The size of the image, ``width`` by ``height`` pixels, determines the distance of the camera.
 
     >>> camera = picture_camera("dimsum_table", 640, 480)
     >>> camera.width, camera.fov_y

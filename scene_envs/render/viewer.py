@@ -40,7 +40,7 @@ def write_viewer(
     title: str | None = None,
     refresh: float | None = None,
 ) -> Path:
-    """Write scenes as one HTML file that any browser with WebGL 2 draws, without a network.
+    """Write scenes as one HTML file that any browser with WebGL 2 draws, without a network; returns its path.
 
     The geometry of each used asset is embedded once, and scenes are embedded as poses. An address that ends with
     ``#scene=3&azimuth=-60&elevation=30`` opens a scene (counted from 0) from a direction (degrees); the page keeps its
@@ -53,9 +53,6 @@ def write_viewer(
         title: Heading of the page; the name of the scene type by default.
         refresh: Seconds after which the page reads its file again, for a file that is still being written; None for
             never.
-
-    Returns:
-        The path.
 
     Raises:
         InvalidInputError: no scenes, or another number of captions.
@@ -195,13 +192,7 @@ def _text(values: NDArray[Any]) -> str:
 class LiveViewer:
     """All scenes shown so far, in one page that the browser reads again every two seconds.
 
-    The page lies in a temporary folder, and stays there when the viewer is closed.
-
-    Args:
-        title: Heading of the page.
-
-    Attributes:
-        path: Path of the page.
+    The page, with the heading ``title``, lies at ``path`` in a temporary folder and stays when the viewer is closed.
     """
 
     REFRESH = 2.0

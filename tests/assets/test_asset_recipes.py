@@ -13,6 +13,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
 from scene_envs.assets import get_library, list_assets
+from scene_envs.assets.base import indefinite_article
 from scene_envs.assets.recipes.furniture import TIERS
 from scene_envs.physics import equilibrium, feasibility, penetration, project, settle
 from scene_envs.physics.parts import PartGeometry
@@ -189,7 +190,7 @@ def test_sizes_masses_and_names_are_the_specified_ones(library, name):
     np.testing.assert_allclose((asset.bounds[1] - asset.bounds[0])[axes], SIZES[name][axes], **exact)
     assert asset.mass == MASSES[name]
     assert asset.static == (name in STATIC)
-    assert f"{asset.article} {asset.display_name}, {asset.plural}" == CALLED[name]
+    assert f"{indefinite_article(asset.display_name)} {asset.display_name}, {asset.plural}" == CALLED[name]
     assert name in FOOD or (len(asset.fine), len(asset.coarse)) == PARTS.get(name, (1, 1))
 
 

@@ -54,7 +54,7 @@ def test_every_format_gives_the_same_brick(tmp_path: Path, suffix: str) -> None:
     write_yaml(tmp_path, f"- {{file: red_brick.{suffix}, density: 2000}}")
     asset = only(tmp_path)
     assert asset.name == "red_brick"
-    assert (asset.article, asset.display_name, asset.plural) == ("a", "red brick", "red bricks")
+    assert (asset.display_name, asset.plural) == ("red brick", "red bricks")
     low, high = asset.bounds
     assert low == pytest.approx([-0.05, -0.03, 0.0], abs=1e-6)
     assert high == pytest.approx([0.05, 0.03, 0.04], abs=1e-6)

@@ -21,7 +21,6 @@ from scene_envs.assets.importing.solids import (
     MAX_CORNERS,
     PartAudit,
     audit_parts,
-    cache_folder,
     enclosing_hull,
     few_cornered_hull,
     snap_to_surface,
@@ -29,6 +28,7 @@ from scene_envs.assets.importing.solids import (
 )
 from scene_envs.assets.shapes import box, convex_hull
 from scene_envs.errors import MissingDependencyError
+from scene_envs.files import cache_folder
 
 
 @pytest.fixture(autouse=True)

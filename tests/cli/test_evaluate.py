@@ -152,7 +152,6 @@ def test_all_leaves_out_what_cannot_be_measured_and_says_why(
     [
         (["measures=novelty"], "novelty needs data="),
         (["measures=prompts"], "needs a prior that reads prompts"),
-        (["measures=fid"], "FID needs fid_weights="),
         (["measures=noveltie"], "did you mean 'novelty'"),
         (["data=nowhere", "measures=layout"], "data='nowhere': nothing is at 'nowhere'"),
         (["heldout=somewhere", "measures=layout"], "needs data="),

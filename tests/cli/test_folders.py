@@ -209,21 +209,6 @@ def test_post_training_saves_when_it_is_told_to_end_and_goes_on_as_if_nothing_ha
     assert len(whole.history) == len(again.history)
 
 
-def test_a_log_has_no_row_twice_and_none_of_another_run(tmp_path):
-    from agents.pretraining.trainer import FIELDS, TrainingLog
-
-    log = TrainingLog(tmp_path)
-    for step in (1, 2, 3, 2, 3, 4):
-        log.write({name: float(step) for name in FIELDS} | {"step": step})
-    with (tmp_path / "log.csv").open("a") as file:
-        file.write("5,0.")  # killed while it wrote
-    log.begin(3)
-    steps = [row.split(",")[0] for row in (tmp_path / "log.csv").read_text().splitlines()]
-    assert steps == ["step", "1", "2", "3"]
-    log.begin(0)  # another run, from the start
-    assert not (tmp_path / "log.csv").exists()
-
-
 def test_a_post_training_log_of_another_run_goes_before_the_first_iteration(tmp_path, monkeypatch):
     from agents.post_training.trainer import PostTrainer
     from tests.helpers.small_runs import small_config

@@ -363,7 +363,7 @@ def test_the_names_that_are_known_without_torch_are_those_of_the_packages():
     masks, rewards, scenes = ast.literal_eval(done.stdout)
     assert own <= set(rewards) <= set(list_rewards()) == set(known_rewards())
     assert set(masks) <= set(list_masks()) == set(known_masks())
-    assert {"culprits", "explicit", "region"} <= set(masks)
+    assert {"culprits", "off_prompt", "random"} <= set(masks)
     assert set(scenes) <= set(list_grammars())
     assert set(NETWORKS) <= set(registered_networks())
 

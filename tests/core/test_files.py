@@ -138,10 +138,10 @@ def test_every_shipped_configuration_has_a_digest():
 def test_a_changed_footer_of_a_shard_is_found(tmp_path):
     import pyarrow.parquet as pq
 
-    from scene_envs.datasets.files import write_shard
+    from scene_envs.datasets.files import encode_shard, write_bytes
 
     path = tmp_path / "scenes-00000.parquet"
-    write_shard(path, np.zeros((3, 2, 16), np.float32), [("A scene.",)] * 3, {"tried": 5, "reasons": {}})
+    write_bytes(path, encode_shard(np.zeros((3, 2, 16), np.float32), [("A scene.",)] * 3, {"tried": 5, "reasons": {}}))
     assert read_notes(path) == {"tried": 5, "reasons": {}, "rows": 3}
     table = pq.read_table(path)
     notes = {key: value.replace(b'"tried": 5', b'"tried": 6') for key, value in table.schema.metadata.items()}

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from scene_envs.datasets import DatasetInfo, SceneDataset, describe_all, read_metadata, to_union
-from scene_envs.datasets.dataset import Part, union_normalizer
+from scene_envs.datasets.dataset import union_normalizer
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
@@ -51,11 +51,13 @@ def test_save_and_load_give_the_same_scenes(dataset: SceneDataset, folder: Path)
     assert (loaded.tensor[..., 2][on_table] == 0).all()
 
 
-def test_hugging_face_datasets_reads_the_shards(dataset: SceneDataset, folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("shard_size", [25, 2000])
+def test_hugging_face_datasets_reads_the_folder(dataset: SceneDataset, tmp_path: Path, shard_size: int) -> None:
     import datasets
 
-    files = sorted(map(str, folder.glob("*.parquet")))
-    loaded = datasets.load_dataset("parquet", data_files=files, cache_dir=str(tmp_path / "cache"))["train"]
+    folder = dataset.save(tmp_path / "scenes", shard_size=shard_size)
+    loaded = datasets.load_dataset(str(folder), cache_dir=str(tmp_path / "cache"))["train"]
+    assert len(loaded) == len(dataset)
     assert loaded.column_names == ["scenes", "language_annotation", "language_annotations"]
     assert loaded["language_annotation"][:] == dataset.prompts
     assert [tuple(prompts) for prompts in loaded["language_annotations"][:]] == dataset.prompt_sets
@@ -91,23 +93,12 @@ def test_metadata_alone_tells_what_a_dataset_holds(folder: Path, dataset: SceneD
     info = read_metadata(folder)
     assert info.stems == ("cafe_table", "dinner_plate", "teacup")
     assert info.welded_model_paths == ("scene_envs/assets/cafe_table",)
-    assert (info.slots, info.features, info.scene_type, info.count) == (5, 16, "toy_cups", 40)
+    assert (info.slots, info.features, info.scene_type) == (5, 16, "toy_cups")
     assert torch.equal(info.normalizer.scale, dataset.normalizer.scale)
     assert info.categories_in(TYPE).tolist() == [0, 1, 2, 3]
 
 
-def test_split_is_disjoint_seeded_and_covers_all(dataset: SceneDataset) -> None:
-    parts = dataset.split((0.5, 0.25, 0.25), seed=1)
-    assert [len(part) for part in parts] == [20, 10, 10]
-    rows = torch.cat([part.tensor for part in parts]).flatten(1)
-    assert len(torch.unique(rows, dim=0)) == 40
-    again = dataset.split((0.5, 0.25, 0.25), seed=1)
-    assert torch.equal(parts[0].tensor, again[0].tensor)
-    assert parts[0].prompts == again[0].prompts
-    assert not torch.equal(parts[0].tensor, dataset.split((0.5,), seed=2)[0].tensor)
-
-
-@pytest.mark.parametrize("fractions", [(0.8, 0.3), (-0.1, 0.5)])
+@pytest.mark.parametrize("fractions", [(0.8, 0.3), (-0.1, 0.5), ()])
 def test_impossible_fractions_are_refused(dataset: SceneDataset, fractions: tuple[float, ...]) -> None:
     with pytest.raises(InvalidInputError, match="fractions"):
         dataset.split(fractions)
@@ -206,7 +197,7 @@ def _dimsum(count: int) -> SceneDataset:
 
 def test_parts_are_disjoint_cover_all_and_have_the_sizes_asked_for_on_average() -> None:
     dataset = _dataset(2000)
-    parts = dataset.stable_split((0.8, 0.1, 0.1), seed=3)
+    parts = dataset.split((0.8, 0.1, 0.1), seed=3)
     names = [set(part.prompts) for part in parts]
     assert sum(map(len, names)) == len(set.union(*names)) == 2000
     expected = np.array([1600, 200, 200])
@@ -216,28 +207,25 @@ def test_parts_are_disjoint_cover_all_and_have_the_sizes_asked_for_on_average() 
 
 def test_a_scene_keeps_its_part_when_the_dataset_grows_or_is_shuffled() -> None:
     dataset = _dataset(300)
-    small = set(dataset[:100].stable_split((0.7, 0.3))[1].prompts)
+    small = set(dataset[:100].split((0.7, 0.3))[1].prompts)
     order = torch.randperm(300, generator=torch.Generator().manual_seed(0))
-    large = set(dataset[order].stable_split((0.7, 0.3))[1].prompts)
+    large = set(dataset[order].split((0.7, 0.3))[1].prompts)
     assert small <= large
     assert {p for p in large if int(p[2:]) < 100} == small
-    assert set(dataset.stable_split((0.7, 0.3), seed=1)[1].prompts) != large
+    assert set(dataset.split((0.7, 0.3), seed=1)[1].prompts) != large
 
 
-@pytest.mark.parametrize("stable", [True, False])
-def test_rows_that_repeat_a_scene_share_its_part(stable: bool) -> None:
+def test_rows_that_repeat_a_scene_share_its_part() -> None:
     """Each scene stands in three rows with other prompts, once with its slots in another order."""
     one = _dataset(60)
     tensor = torch.cat([one.tensor, one.tensor[:, [0, 4, 3, 2, 1]], one.tensor])
     prompts = [f"{row}" for row in range(60)] * 3
     dataset = SceneDataset(tensor, prompts, one.normalizer, TYPE)
-    parts = dataset.stable_split((0.5, 0.5)) if stable else dataset.split((0.5, 0.5))
+    parts = dataset.split((0.5, 0.5))
     assert sum(map(len, parts)) == 180
     for part in parts:
         assert set(Counter(part.prompts).values()) == {3}
     assert len(set(dataset.keys.tolist())) == 60
-    if not stable:
-        assert [len(part) for part in parts] == [90, 90]
 
 
 def test_keys_tell_poses_apart_and_ignore_empty_slots() -> None:
@@ -249,12 +237,6 @@ def test_keys_tell_poses_apart_and_ignore_empty_slots() -> None:
     wider = SceneDataset(SceneBatch(tensor, TYPE).with_slots(9).tensor, ["a", "b"], dataset.normalizer, TYPE)
     assert dataset.keys[0] != dataset.keys[1]
     assert (dataset.keys == wider.keys).all()
-
-
-@pytest.mark.parametrize(("fractions", "index"), [((0.7, 0.6), 0), ((-0.1, 0.5), 0), ((0.5,), 1), ((), 0)])
-def test_impossible_parts_are_refused(fractions: tuple[float, ...], index: int) -> None:
-    with pytest.raises(InvalidInputError):
-        Part(fractions, index)
 
 
 # -- unions -----------------------------------------------------------------------------------------
@@ -393,7 +375,7 @@ def test_doubles_and_halves(scenes: torch.Tensor, tmp_path: Path, kind: pa.DataT
 
 @pytest.mark.slow
 def test_hugging_face_files_and_folders(scenes: torch.Tensor, tmp_path: Path) -> None:
-    """``Array2D`` columns; ``save_to_disk`` with two files and rows chosen by an index; ``to_parquet``; in memory."""
+    """``Array2D`` columns; ``save_to_disk`` with two files and rows chosen by an index; ``to_parquet``."""
     import datasets
 
     columns = {"scenes": datasets.Array2D((5, 16), "float64"), "language_annotation": datasets.Value("string")}
@@ -404,11 +386,7 @@ def test_hugging_face_files_and_folders(scenes: torch.Tensor, tmp_path: Path) ->
     assert len(list((tmp_path / "train").glob("*.arrow"))) == 2
     theirs.to_parquet(tmp_path / "theirs.parquet")
     expected = scenes.flip(0)
-    for loaded in (
-        _load(tmp_path / "train"),
-        _load(tmp_path / "theirs.parquet"),
-        SceneDataset.from_huggingface(theirs, tmp_path, scene_type="toy_cups"),
-    ):
+    for loaded in (_load(tmp_path / "train"), _load(tmp_path / "theirs.parquet")):
         torch.testing.assert_close(loaded.tensor, expected, atol=1e-6, rtol=0)
         assert loaded.prompts == PROMPTS[::-1]
 

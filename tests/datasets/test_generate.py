@@ -10,7 +10,6 @@ import pickle
 import signal
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -134,28 +133,6 @@ def _hashes(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
 
 
-class _Killed(BaseException):
-    """Stands for a killed process."""
-
-
-def _generate_and_die(output: Path, verdicts: Callable[[SceneBatch, str], list[str]]) -> None:
-    """Generate until more than ten candidates are judged, in chunks of five at most."""
-    judged = 0
-
-    def judge(batch: SceneBatch, physics: str) -> list[str]:
-        nonlocal judged
-        judged += len(batch)
-        if judged > 10:
-            raise _Killed
-        return verdicts(batch, physics)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generation, "judge_scenes", judge)
-        patch.setattr(generation, "_MAX_CHUNK", 5)
-        with pytest.raises(_Killed):
-            generate_cups(output)
-
-
 def _generate_slowly(output: Path) -> None:
     def slowly(batch: SceneBatch, physics: str) -> list[str]:
         time.sleep(0.05)
@@ -168,9 +145,9 @@ def _generate_slowly(output: Path) -> None:
 
 @pytest.mark.slow
 def test_killed_and_started_again_the_files_are_the_same(cups: Path, tmp_path: Path) -> None:
-    """Killed in the middle of the second shard; the first is whole, and the journal holds what was judged."""
+    """Killed in the middle of the second shard; the first is whole."""
     process = forked(_generate_slowly, tmp_path)
-    while process.is_alive() and not (tmp_path / ".scenes-00001.parquet.journal").exists():
+    while process.is_alive() and not (tmp_path / "scenes-00000.parquet").exists():
         time.sleep(0.002)
     process.kill()
     process.join()
@@ -179,30 +156,6 @@ def test_killed_and_started_again_the_files_are_the_same(cups: Path, tmp_path: P
     assert not (tmp_path / "scenes-00001.parquet").exists()
     (tmp_path / ".scenes-00001.parquet.999999999.partial").write_bytes(b"PAR1 half a file")  # of a process that ended
     generate_cups(tmp_path)
-    assert _hashes(tmp_path) == _hashes(cups)
-
-
-@pytest.mark.slow
-def test_what_was_judged_before_a_kill_is_not_judged_again(
-    cups: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _generate_and_die(tmp_path, judge_scenes)
-    (journal,) = tmp_path.glob(".*.journal")
-    known = journal.read_text().count("\n")
-    assert 5 <= known <= 10
-    lines = journal.read_text().splitlines(keepends=True)
-    journal.write_text("".join([*lines[:5], *lines[3:], f"{known} penetr"]))  # told twice; killed while it wrote a line
-    counted = 0
-
-    def count(batch: SceneBatch, physics: str) -> list[str]:
-        nonlocal counted
-        counted += len(batch)
-        return judge_scenes(batch, physics)
-
-    monkeypatch.setattr(generation, "judge_scenes", count)
-    monkeypatch.setattr(generation, "_MAX_CHUNK", 1)
-    report = generate_cups(tmp_path)
-    assert counted == report.tried - known
     assert _hashes(tmp_path) == _hashes(cups)
 
 
@@ -301,17 +254,6 @@ def test_slow_grammars_report_scene_by_scene(tmp_path: Path, monkeypatch: pytest
     generate_cups(tmp_path)
     assert set(chunks) == {1}
     assert _hashes(tmp_path) == _hashes(cups)
-
-
-@pytest.mark.slow
-def test_a_grammar_that_was_changed_since_is_judged_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sample = ToyGrammar.sample_array
-    with monkeypatch.context() as patch:  # what an earlier grammar made was in order
-        patch.setattr(ToyGrammar, "sample_array", lambda self, rng, count: sample(self, rng.spawn(1)[0], count))
-        _generate_and_die(tmp_path, lambda batch, physics: ["kept"] * len(batch))
-    generate_cups(tmp_path)
-    batch = SceneDataset.load(tmp_path).batch()
-    assert set(judge_scenes(batch)) == {generation.KEPT}
 
 
 def test_the_normalizer_is_fixed_by_the_grammar_and_fills_the_range(cups: Path) -> None:

@@ -79,7 +79,7 @@ def test_info_has_the_same_numeric_keys_at_reset_and_at_every_step(prior, height
 
 
 def test_the_spec_goes_to_json_and_back(prior, monkeypatch):
-    monkeypatch.setattr(env_spaces, "resolve_prior", lambda name: prior)
+    monkeypatch.setattr(env_spaces, "resolve_prior", lambda name, device: prior)
     env = gym.make(ID, scene="dimsum_table", reward="object_count", num_steps=2, prior="dimsum_table", workers=0)
     spec = gym.envs.registration.EnvSpec.from_json(env.spec.to_json())
     assert spec.kwargs == {**json.loads(env.spec.to_json())["kwargs"]}

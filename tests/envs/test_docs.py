@@ -34,7 +34,8 @@ def test_page_is_the_docstring_in_gymnasiums_order(page, env):
 
 @pytest.mark.parametrize("env", [DenoisingEnv, SearchEnv, SearchMaskEnv])
 def test_every_argument_is_in_the_table_with_its_default(env):
-    rows = (inspect.getdoc(env) or "").splitlines()
+    others = [SearchEnv] if env is SearchMaskEnv else []  # whose page says that its other arguments are the same
+    rows = [row for one in (env, *others) for row in (inspect.getdoc(one) or "").splitlines()]
     for name, parameter in inspect.signature(env).parameters.items():
         default = f'"{parameter.default}"' if isinstance(parameter.default, str) else str(parameter.default)
         assert any(row.startswith(f"| `{name}` | `{default}` |") for row in rows), name

@@ -209,7 +209,7 @@ def test_prompts_of_the_grammar_are_true_english(reader):
 
 
 def test_prompts_go_to_json_and_back(reader, monkeypatch):
-    monkeypatch.setattr(env_spaces, "resolve_prior", lambda name: reader)
+    monkeypatch.setattr(env_spaces, "resolve_prior", lambda name, device: reader)
     env = gym.make(ID, num_steps=2, prior="mine", prompt=PROMPTS, guidance=1.0, action_mode="noise")
     spec = gym.envs.registration.EnvSpec.from_json(env.spec.to_json())
     assert json.loads(env.spec.to_json())["kwargs"]["prompt"] == PROMPTS
@@ -248,7 +248,7 @@ def test_search_inpaints_under_the_prompt(reader):
     assert not torch.equal(roots[0].scene, roots[1].scene)
     assert not torch.equal(roots[0].scene, roots[2].scene)
     assert all(root.valid and 0.0 <= root.value <= 1.0 for root in roots)
-    child = first.expand(roots[0], 0)
+    (child,) = first.expand_batch([(roots[0], 0)])
     kept = ~roots[0].mask
     assert torch.equal(child.scene[kept], roots[0].scene[kept])
     assert (first.evaluations, guided.evaluations) == (6, 4)  # two roots and a child; one root with both branches

@@ -6,7 +6,8 @@ import json
 import pickle
 import re
 import warnings
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -20,7 +21,6 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from agents.planning import BeamPlanner, BestOfPlanner, GreedyPlanner, Journal, MCTSPlanner, Session
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardOutput
-from scene_envs import check_branchable
 from scene_envs.envs import ResetNeededError, SearchEnv, SearchMaskEnv
 from scene_envs.envs.search import NodeRandomness
 from scene_envs.errors import InvalidInputError, UnknownNameError
@@ -96,6 +96,39 @@ def test_phi_is_clipped_to_the_unit_interval(prior):
         env = SearchEnv(prior=prior, objective=objective, num_steps=1)
         env.reset(seed=0)
         assert env.evaluate() == expected
+
+
+def plain_parts(value: Any) -> list[Any]:
+    """The leaves of nested data."""
+    if is_dataclass(value):
+        value = [getattr(value, field.name) for field in fields(value)]
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    return [part for item in value for part in plain_parts(item)] if isinstance(value, list | tuple) else [value]
+
+
+@pytest.mark.parametrize("name", ["env", "mask_env"])
+def test_planners_can_rely_on_states(name: str, request: pytest.FixtureRequest) -> None:
+    """States are immutable plain data, and expansion changes neither its state nor the current one."""
+    env = request.getfixturevalue(name)
+    env.reset(seed=0)
+    root = env.clone_state()
+    before = pickle.dumps(root)
+    actions = list(env.legal_actions(root))[:3]
+    children = env.expand_batch([(root, action) for action in actions])
+    backwards = [env.expand(pickle.loads(before), action) for action in reversed(actions)][::-1]
+    assert children == backwards
+    assert [child.value for child in children] == [child.value for child in backwards]
+    assert pickle.dumps(root) == before
+    assert env.clone_state() is root
+    for state in (root, *children):
+        assert pickle.loads(pickle.dumps(state)) == state
+        assert 0.0 <= env.evaluate(state) <= 1.0
+        assert all(isinstance(part, bool | int | float | torch.Tensor | None) for part in plain_parts(state))
+        with pytest.raises(FrozenInstanceError):
+            state.value = 1.0
+        env.restore_state(state)
+        assert env.clone_state() is state
 
 
 def test_children_do_not_depend_on_order_or_company(env):
@@ -276,7 +309,7 @@ def test_fingerprints_are_of_the_set_of_objects(env):
 
 
 def test_spec_goes_to_json_and_actions_are_checked(env, prior, free_objects, monkeypatch):
-    monkeypatch.setattr("scene_envs.envs.spaces.resolve_prior", lambda name: prior)
+    monkeypatch.setattr("scene_envs.envs.spaces.resolve_prior", lambda name, device: prior)
     made = gym.make(ID, objective="object_count", branching=2, num_steps=2)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(made.spec.to_json()))
     assert data_equivalence(made.reset(seed=1), again.reset(seed=1), exact=True)
@@ -349,7 +382,7 @@ def test_an_episode_that_is_over_at_its_reset_ends_with_the_first_step(prior, fr
     assert env.step(0)[1] == 0.0
 
 
-@pytest.mark.parametrize("objective", ["diversity", {"name": "clip", "reward": "coverage", "low": 0.0}])
+@pytest.mark.parametrize("objective", ["diversity", {"name": "clip", "reward": "diversity", "low": 0.0}])
 def test_an_objective_that_depends_on_the_batch_is_refused(prior, objective):
     with pytest.raises(InvalidInputError, match="by the other scenes of its batch"):
         SearchEnv(prior=prior, objective=objective, branching=3, num_steps=2)
@@ -383,7 +416,26 @@ def test_check_env_passes_with_a_choice_of_masks(mask_kwargs: dict[str, Any], mo
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(gym.make(MASK_ID, **mask_kwargs).unwrapped)
-        check_branchable(gym.make(MASK_ID, **mask_kwargs), children=6)
+
+
+@pytest.mark.parametrize("copies", [None, 2])
+@pytest.mark.parametrize("name", ["Denoising-v0", "Search-v0", "SearchMask-v0"])
+def test_torchrl_wraps_every_environment(name: str, copies: int | None, mask_kwargs: dict[str, Any]) -> None:
+    from torchrl.envs import GymWrapper
+    from torchrl.envs.utils import check_env_specs
+
+    name, kwargs = f"scene_envs:SceneEnvs/{name}", dict(mask_kwargs)
+    if "Search-" in name:
+        del kwargs["masks"]
+    if "Denoising" in name:
+        kwargs = {"prior": kwargs["prior"], "reward": "object_count", "num_steps": 2}
+    if copies is None:
+        env = GymWrapper(gym.make(name, **kwargs))
+    else:
+        makers = [lambda: gym.make(name, **kwargs)] * copies
+        env = GymWrapper(gym.vector.SyncVectorEnv(makers, autoreset_mode=gym.vector.AutoresetMode.DISABLED))
+    check_env_specs(env, seed=0, break_when_any_done="both")
+    assert env.rollout(2).batch_size == (() if copies is None else (copies,)) + (2,)
 
 
 def test_two_environments_with_a_choice_of_masks_live_the_same_life(mask_kwargs: dict[str, Any]) -> None:
@@ -490,7 +542,7 @@ def test_planners_search_it(mask_env: SearchMaskEnv, planner: type, tmp_path: An
 def test_the_spec_goes_to_json_and_bad_masks_are_named(
     mask_kwargs: dict[str, Any], prior: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("scene_envs.envs.spaces.resolve_prior", lambda name: prior)
+    monkeypatch.setattr("scene_envs.envs.spaces.resolve_prior", lambda name, device: prior)
     masks = ["random", {"name": "empty", "count": 3}]
     made = gym.make(MASK_ID, objective="object_count", masks=masks, num_steps=2)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(made.spec.to_json()))

@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.linalg import sqrtm
-from torch import nn
 
 from agents.evaluation import grammar_scenes
 from agents.evaluation.classifier import ClassifierConfig
 from agents.evaluation.pictures import (
-    _Pooling,
     class_images,
     feature_distance,
-    frechet_inception_distance,
     frechet_scene_distance,
     gaussian_distance,
-    load_inception,
     render_classifier_accuracy,
 )
 from agents.evaluation.set_network import SHIPPED, SetEncoder, blurred
 from benchmarks.set_encoder_training import SetEncoderTraining, damage, train_set_encoder
 from scene_envs.datasets import to_union
-from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
+from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.render import render
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import union_scene_type
@@ -188,50 +183,6 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 def test_too_few_scenes_have_no_distance(real: SceneBatch) -> None:
     with pytest.raises(InvalidInputError, match="got 1 and 5"):
         frechet_scene_distance(real[:1], real[:5])
-
-
-def test_inception_without_weights_says_so(tmp_path: Path, real: SceneBatch) -> None:
-    with pytest.raises(InvalidInputError, match="no Inception-v3 weights"):
-        frechet_inception_distance(real[:2], real[2:4], tmp_path / "none.pth")
-
-
-def test_inception_without_torchvision_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "weights.pth"
-    torch.save({"fc.weight": torch.zeros(1000, 2048)}, path)
-    monkeypatch.setitem(sys.modules, "torchvision.models.inception", None)
-    with pytest.raises(MissingDependencyError, match="torchvision"):
-        load_inception(path)
-
-
-def test_tensorflow_pooling_leaves_out_the_padding() -> None:
-    class Block(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.branch_pool = nn.Conv2d(2, 3, 1)
-
-        def forward(self, x: torch.Tensor) -> torch.Tensor:
-            return torch.cat([x, self.branch_pool(nn.functional.avg_pool2d(x, 3, 1, 1))], dim=1)
-
-    block, ones = Block(), torch.ones(1, 2, 4, 4)
-    expected = block.branch_pool(ones)  # an average of ones is one, at the border too
-    for maximum in (False, True):
-        out = _Pooling(block, maximum)(ones)
-        assert torch.equal(out[:, :2], ones)
-        assert torch.allclose(out[:, 2:], expected, atol=1e-6)
-    assert not torch.allclose(block(ones)[:, 2:], expected, atol=1e-3)
-
-
-@pytest.mark.parametrize("classes", [1000, 1008])
-def test_inception_reads_both_kinds_of_weights(tmp_path: Path, classes: int) -> None:
-    inception = pytest.importorskip("torchvision.models.inception")
-    network = inception.Inception3(num_classes=classes, aux_logits=classes == 1000, init_weights=False)
-    path = tmp_path / "weights.pth"
-    torch.save(network.state_dict(), path)
-    features = load_inception(path)(torch.zeros(1, 3, 299, 299))
-    assert features.shape == (1, 2048)
-    torch.save({"fc.weight": torch.zeros(1000, 2048)}, path)
-    with pytest.raises(CorruptFileError, match="does not fit"):
-        load_inception(path)
 
 
 QUICK = ClassifierConfig(epochs=5, batch_size=16)

@@ -33,6 +33,7 @@ from scene_envs.export.placed import (
     textured_mesh,
     visual_mesh,
 )
+from scene_envs.export.sdf import roll_pitch_yaw
 from scene_envs.normalizer import Normalizer
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
@@ -54,7 +55,7 @@ def test_each_scene_has_a_folder_and_assets_are_shared(folder, batch):
     assert len([name for name in names if name.startswith("scene_")]) == len(batch)
     used = {name for row in batch.names() for name in row}
     assert {path.name for path in (folder / "assets").iterdir()} == used
-    expected = {"objects.json", "world.sdf", "scene.dmd.yaml", "scene.xml", "scene.glb", "scene.npz", "scene.pkl"}
+    expected = {"objects.json", "world.sdf", "scene.dmd.yaml", "scene.xml", "scene.glb", "scene.npz"}
     assert expected <= {path.name for path in (folder / "scene_000").iterdir()}
     parts = sorted((folder / "assets" / "teacup").glob("part_*.obj"))
     assert len(parts) == len(DIMSUM.library["teacup"].fine)
@@ -141,6 +142,35 @@ def test_angle_axis_and_quaternion_are_exact_at_every_angle(angle):
         np.testing.assert_allclose(back, rotation, atol=1e-14)
 
 
+@pytest.mark.parametrize("pitch", [0.0, 1e-9, 0.5, np.pi / 2 - 1e-8, np.pi / 2, -np.pi / 2, np.pi])
+def test_roll_pitch_and_yaw_are_exact_at_every_angle(pitch):
+    for roll, yaw in [(0.0, 0.0), (2.0, -3.0), (np.pi, 1e-9)]:
+        rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
+        back = Rotation.from_euler("xyz", roll_pitch_yaw(rotation)).as_matrix()
+        np.testing.assert_allclose(back, rotation, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_pybullet_reads_the_rotations_of_an_sdf_world(folder, scenes):
+    pybullet = pytest.importorskip("pybullet")
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        bodies = pybullet.loadSDF(str(folder / "scene_000" / "world.sdf"), physicsClientId=client)
+        assert len(bodies) == len(scenes[0].objects)
+        found = []
+        for body in bodies:
+            at, turn = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
+            inertial = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)
+            back = pybullet.invertTransform(inertial[3], inertial[4])
+            at, turn = pybullet.multiplyTransforms(at, turn, *back)
+            found.append((np.array(at), Rotation.from_quat(turn).as_matrix()))
+    finally:
+        pybullet.disconnect(client)
+    for thing, (at, turn) in zip(scenes[0].objects, found, strict=True):
+        np.testing.assert_allclose(turn, thing.rotation, atol=1e-6, err_msg=thing.name)
+        np.testing.assert_allclose(at, thing.translation, atol=1e-6, err_msg=thing.name)
+
+
 @pytest.mark.slow
 def test_translations_are_written_to_the_last_bit(folder, scenes):
     text = (folder / "scene_003" / "scene.xml").read_text()
@@ -224,13 +254,13 @@ def test_only_usd_needs_a_package_and_says_which(tmp_path, monkeypatch):
         export(laid_scene(), tmp_path / "out", "usd")
     assert not (tmp_path / "out").exists()
     report = export(laid_scene(), tmp_path / "out")
-    assert set(report.formats) == {*TEXT, "glb", "npz", "pickle"}
+    assert set(report.formats) == {*TEXT, "glb", "npz"}
 
 
 def test_writing_needs_no_simulator(tmp_path, monkeypatch):
     for name in ("pybullet", "mujoco", "pydrake", "pxr"):
         monkeypatch.setitem(sys.modules, name, None)  # importing it fails
-    export(laid_scene(), tmp_path / "out", [*TEXT, "glb", "npz", "pickle"])
+    export(laid_scene(), tmp_path / "out", [*TEXT, "glb", "npz"])
 
 
 def test_no_scenes_and_empty_scenes_are_fine(tmp_path):

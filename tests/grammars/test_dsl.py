@@ -16,14 +16,12 @@ from scene_envs.assets.shapes import box, ring, solid
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import (
     NOTHING,
-    FreeSurface,
     Gaussian,
     Geometric,
     Grammar,
     Group,
     Object,
     OneOf,
-    Outline,
     Region,
     Repeat,
     Stack,
@@ -33,7 +31,17 @@ from scene_envs.grammars import (
     list_grammars,
     register_grammar,
 )
-from scene_envs.grammars.surface import Disc, Placed, Rectangle, _top_on_axis, carrying_height, meet, plan_of
+from scene_envs.grammars.surface import (
+    Disc,
+    FreeSurface,
+    Outline,
+    Placed,
+    Rectangle,
+    _top_on_axis,
+    carrying_height,
+    meet,
+    plan_of,
+)
 from scene_envs.scene_types import get_scene_type
 
 HERE = Gaussian()

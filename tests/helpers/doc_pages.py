@@ -55,7 +55,6 @@ SMALLER: dict[str, dict[str, str]] = {
         "budget=64, branching=4": "budget=2, branching=2, num_steps=20, slots=13",
         "branching=4)": "branching=2, num_steps=20, slots=13)",
         "budget=32": "budget=2",
-        "num_steps=2))": "num_steps=2, slots=8))",
     },
 }
 """Text of Python blocks, by page, and what a test puts in its place: the same calls with smaller numbers."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from scene_envs.assets import get_library
-from scene_envs.datasets.prompts import (
+from scene_envs.datasets.prompts.claims import (
     Claim,
     NameCount,
     ObjectCount,

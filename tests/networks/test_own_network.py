@@ -15,8 +15,7 @@ from agents.networks import (
     MixedFluxConfig,
     MixedMiDiffusionConfig,
     list_networks,
-    match_parameters,
-    parameter_count,
+    network_config,
     registry,
 )
 from agents.networks.registry import register_network
@@ -35,7 +34,7 @@ def test_it_is_listed_without_an_import_of_its_package() -> None:
     assert list_networks("mixed") == ["flux", "midiffusion", "diffuscene", "deep_sets"]
     assert "deep_sets" not in list_networks("continuous")
     with pytest.raises(UnknownNameError, match="did you mean 'deep_sets'"):
-        match_parameters("deep_set", "mixed", 1000)
+        network_config("deep_set", "mixed", features=20, categories=8, hidden=16, depth=2, heads=2)
 
 
 @pytest.mark.usefixtures("few_grammar_scenes")
@@ -52,12 +51,6 @@ def test_two_steps_train_it_and_its_files_give_it_back(tmp_path: Path) -> None:
     assert (network.config.hidden, network.config.depth) == (16, 3)
     assert bool(torch.isfinite(prior.sample(2, num_steps=3, seed=0).tensor).all())
     assert float(network.out.weight.detach().abs().sum()) > 0
-
-
-def test_its_size_is_matched_like_any_other() -> None:
-    keys = {"features": 20, "categories": 8, "depth": 2, "heads": 4}
-    found = match_parameters("deep_sets", "mixed", 30_000, **keys)
-    assert abs(parameter_count(found) / 30_000 - 1) < 0.1
 
 
 @pytest.mark.usefixtures("few_grammar_scenes")

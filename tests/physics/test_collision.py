@@ -159,9 +159,10 @@ def depth_of(
     overlap.
     """
     rotation = np.stack([np.eye(3) if base is None else base, np.eye(3) if turn is None else turn])
-    found = Overlaps([first, second], [[0], [1]])(np.array([0, 1]), rotation, np.array([CENTER, translation]))
-    assert found is not None
+    poses = np.array([0, 1]), rotation, np.array([CENTER, translation])
+    *found, unmeasured = Overlaps([first, second], [[0], [1]])(*poses, np.array([0]), np.array([1]))
     assert [values.shape for values in found] in ([(0,)] * 3, [(1,)] * 3)
+    assert len(unmeasured) == 0
     return float(found[2].sum())
 
 
@@ -279,58 +280,50 @@ def test_both_parts_move_together(pairs: Pairs, depths: Array) -> None:
 
 
 @pytest.mark.slow
-def test_a_pair_does_not_depend_on_the_others(pairs: Pairs) -> None:
-    """Bit for bit: at its place alone, before and after others that are far away, and many times over."""
+def test_a_pair_does_not_depend_on_the_others(pairs: Pairs, depths: Array) -> None:
+    """Bit for bit: alone, and among others in any order."""
     overlaps, _, placed, count = pairs
-
-    def depth(rows: list[int], offsets: list[float]) -> list[float]:
-        """Depths of pairs, each at its own offset along x (m)."""
-        order = np.array([(row, row + count) for row in rows]).ravel()
-        shift = np.repeat(np.array(offsets)[:, None] * (1.0, 0.0, 0.0), 2, axis=0)
-        found = overlaps(placed.part[order], placed.rotation[order], placed.translation[order] + shift)
-        assert found is not None
-        out = np.zeros(len(rows))
-        out[found[0] // 2] = found[2]
-        return out.tolist()
-
     for row in range(0, count, 25):
-        (alone,) = depth([row], [0.0])
-        others = [(row + 7) % count, (row + 301) % count]
-        assert depth([row, *others], [0.0, 80.0, 160.0])[0] == alone
-        assert depth([*others, row], [80.0, 160.0, 0.0])[2] == alone
-        assert depth([row], [0.0]) == [alone]
+        for rows in ([row], [row, (row + 7) % count], [(row + 301) % count, row]):
+            found = measured(overlaps, placed, np.array(rows), np.array(rows) + count)
+            assert found.tolist() == depths[rows].tolist()
 
 
 def test_bodies_at_one_pose_are_all_found() -> None:
     """Six equal cubes at one pose: fifteen pairs, each as deep as a whole side; turned, and two of two kinds."""
     for turn in (np.eye(3), SPIN):
         overlaps = Overlaps([CUBE, 0.5 * CUBE], [[0], [0], [1]])
-        found = overlaps(np.zeros(6, dtype=np.int64), np.stack([turn] * 6), np.full((6, 3), 0.3))
-        assert found is not None
-        assert set(zip(*(rows.tolist() for rows in found[:2]), strict=True)) == set(combinations(range(6), 2))
-        np.testing.assert_allclose(found[2], 1.0, atol=EXACT)
-        two = overlaps(np.array([0, 1, 2]), np.stack([turn] * 3), np.zeros((3, 3)))
-        assert two is not None
-        order = np.lexsort((two[1], two[0]))
-        np.testing.assert_allclose(two[2][order], [1.0, 0.75, 0.75], atol=EXACT)
+        pairs = np.triu_indices(6, k=1)
+        first, second, depth, _ = overlaps(
+            np.zeros(6, dtype=np.int64), np.stack([turn] * 6), np.full((6, 3), 0.3), *pairs
+        )
+        assert set(zip(first.tolist(), second.tolist(), strict=True)) == set(combinations(range(6), 2))
+        np.testing.assert_allclose(depth, 1.0, atol=EXACT)
+        poses = np.array([0, 1, 2]), np.stack([turn] * 3), np.zeros((3, 3))
+        first, second, depth, _ = overlaps(*poses, *np.triu_indices(3, k=1))
+        np.testing.assert_allclose(depth[np.lexsort((second, first))], [1.0, 0.75, 0.75], atol=EXACT)
 
 
-def test_fixed_bodies_are_no_pair_and_bodies_of_several_parts_list_each() -> None:
+def test_pairs_that_are_asked_for_are_listed_and_bodies_of_several_parts_list_each() -> None:
     """A body of two cubes side by side, of which both overlap a third one."""
     overlaps = Overlaps([CUBE, CUBE + np.array([1.0, 0.0, 0.0])], [[0], [0, 1]])
     kind, rotation = np.array([1, 0, 0]), np.stack([np.eye(3)] * 3)
-    places = np.array([CENTER, (0.5, 0.0, 0.9), (0.0, 0.0, 5.0)])
-    found = overlaps(kind, rotation, places)
-    assert found is not None
-    assert (found[0].tolist(), found[1].tolist()) == ([0, 0], [1, 1])
-    np.testing.assert_allclose(found[2], [0.1, 0.1], atol=EXACT)
-    for fixed, count in (([True, False, False], 2), ([True, True, False], 0), ([True, True, True], 0)):
-        found = overlaps(kind, rotation, places, np.array(fixed))
-        assert found is not None
-        assert len(found[2]) == count
-    nothing = overlaps(kind[:0], rotation[:0], places[:0])
-    assert nothing is not None
-    assert [values.shape for values in nothing] == [(0,)] * 3
+    poses = kind, rotation, np.array([CENTER, (0.5, 0.0, 0.9), (0.0, 0.0, 5.0)])
+    first, second, depth, _ = overlaps(*poses, *np.triu_indices(3, k=1))
+    assert (first.tolist(), second.tolist()) == ([0, 0], [1, 1])
+    np.testing.assert_allclose(depth, [0.1, 0.1], atol=EXACT)
+    for pairs, count in (([(0, 1), (0, 2)], 2), ([(0, 2), (1, 2)], 0), ([(1, 0)], 2)):
+        assert len(overlaps(*poses, *np.array(pairs).T)[2]) == count
+    nothing = overlaps(kind[:0], rotation[:0], poses[2][:0], kind[:0], kind[:0])
+    assert [values.shape for values in nothing] == [(0,)] * 4
+
+
+def test_a_scene_with_too_many_pairs_of_parts_is_named_and_others_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scene_envs.physics.mujoco._TOO_MANY", 2)
+    poses = np.zeros(5, dtype=np.int64), np.stack([np.eye(3)] * 5), np.zeros((5, 3))
+    first, second = np.array([0, 0, 1, 3]), np.array([1, 2, 2, 4])
+    found = Overlaps([CUBE], [[0]])(*poses, first, second, np.array([0, 0, 0, 1, 1]))
+    assert [values.tolist() for values in found] == [[3], [4], [pytest.approx(1.0, abs=EXACT)], [0]]
 
 
 @pytest.mark.slow

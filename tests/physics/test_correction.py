@@ -10,33 +10,33 @@ import torch
 
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import furniture_overlap, penetration
-from scene_envs.physics.correction import corrections, falls
-from scene_envs.physics.motion import physics_of
-from scene_envs.physics.placement import flatten
+from scene_envs.physics.correction import corrections
 from scene_envs.scene import SceneBatch
 from tests.helpers.simple_scenes import SIDE, TYPE
 from tests.helpers.simple_scenes import scene as boxes
 
-EVEN, FLAT = np.array([0.01, 0.01, 0.01]), np.array([0.01, 0.01, 1e-4])
+EVEN, FLAT = torch.tensor([0.01, 0.01, 0.01]), torch.tensor([0.01, 0.01, 1e-4])
 """Standard deviations, m: the same along all axes, and small along z."""
 CLEARANCE = 1e-4
 
 
-def after(scene: SceneBatch, spread: np.ndarray = EVEN, movable: np.ndarray | None = None) -> torch.Tensor:
+def after(scene: SceneBatch, spread: torch.Tensor = EVEN, movable: torch.Tensor | None = None) -> torch.Tensor:
     """(N, 3) moves of the first scene, m."""
     return corrections(scene, spread, movable)[0]
 
 
-def fallen(scene: SceneBatch, limit: float = 0.03) -> torch.Tensor:
+def fallen(scene: SceneBatch) -> torch.Tensor:
     """(N,) falls of the first scene, m."""
-    physics = physics_of(scene.scene_type, "bullet")
-    categories = scene.categories.numpy()
-    welded = np.isin(categories, np.array(scene.scene_type.welded_categories))
-    poses = scene.translations.double().numpy(), scene.rotations.double().numpy()
-    objects = flatten(physics.library, *poses, categories, welded)
-    out = torch.zeros(scene.tensor.shape[1])
-    out[objects.slot] = torch.from_numpy(falls(physics.collider, objects, limit)).float()
-    return out
+    moves = after(scene, FLAT)
+    assert not moves[:, :2].any()
+    return -moves[:, 2]
+
+
+def noisy(scene_type: str, count: int, seed: int, size: float = 0.01) -> SceneBatch:
+    """Real scenes whose free objects are displaced at random."""
+    real = get_grammar(scene_type).sample(np.random.default_rng(seed), count)
+    noise = size * torch.randn(real.translations.shape, generator=torch.Generator().manual_seed(seed))
+    return real.with_poses(real.translations + noise * real.is_free.unsqueeze(-1), real.rotations)
 
 
 # -- falls ------------------------------------------------------------------------------------------
@@ -51,7 +51,7 @@ def test_objects_fall_by_their_height_and_follow_what_they_stand_on() -> None:
 
 def test_objects_far_above_everything_stay() -> None:
     assert not fallen(boxes(("cube", 0.0, 0.0, 0.031))).any()
-    assert float(fallen(boxes(("cube", 0.0, 0.0, 0.031)), limit=0.04)[1]) == pytest.approx(0.031, abs=1e-6)
+    assert float(fallen(boxes(("cube", 0.0, 0.0, 0.029)))[1]) == pytest.approx(0.029, abs=1e-6)
     assert not fallen(boxes(("cube", 3.0, 0.0, 0.01))).any()  # beside the floor
 
 
@@ -73,7 +73,7 @@ def test_two_objects_share_the_shortest_way_apart() -> None:
 
 def test_a_fixed_object_leaves_the_whole_way_to_the_other() -> None:
     scene = boxes(("cube", 0.0, 0.0, 0.0), ("cube", SIDE - 0.01, 0.03, 0.0))
-    movable = np.arange(scene.tensor.shape[1])[None] != 1
+    movable = torch.arange(scene.tensor.shape[1])[None] != 1
     moves = after(scene, EVEN, movable)
     assert not moves[1].any()
     torch.testing.assert_close(moves[2], torch.tensor([0.01, 0.0, 0.0]), atol=CLEARANCE, rtol=0.0)
@@ -105,15 +105,36 @@ def test_real_scenes_stay_as_they_are() -> None:
         assert float(corrections(real, FLAT).abs().max()) < 1e-3
 
 
-def test_overlaps_of_noisy_scenes_shrink_and_fixed_objects_stay() -> None:
-    real = get_grammar("dimsum_table").sample(np.random.default_rng(1), 6)
-    noise = 0.01 * torch.randn(real.translations.shape, generator=torch.Generator().manual_seed(0))
-    noisy = real.with_poses(real.translations + noise * real.is_free.unsqueeze(-1), real.rotations)
-    moves = corrections(noisy, EVEN)
-    assert not moves[~noisy.is_free].any()
-    moved = noisy.with_poses(noisy.translations + moves, noisy.rotations)
-    before, now = (penetration(batch).total_per_pair.sum() for batch in (noisy, moved))
-    assert float(now) < 0.1 * float(before)
+@pytest.mark.parametrize(
+    "scene_type", ["dimsum_table", "restaurant_low_clutter", "living_room_shelf", "breakfast_table_low_clutter"]
+)
+def test_overlaps_of_noisy_scenes_shrink_and_fixed_objects_stay(scene_type: str) -> None:
+    scenes = noisy(scene_type, 6, 1)
+    moves = corrections(scenes, EVEN)
+    assert not moves[~scenes.is_free].any()
+    moved = scenes.with_poses(scenes.translations + moves, scenes.rotations)
+    before, now = (penetration(batch).total_per_pair.sum() for batch in (scenes, moved))
+    assert float(now) < 0.3 * float(before)
+
+
+def test_objects_in_any_order_move_alike() -> None:
+    scenes = noisy("dimsum_table", 4, 3)
+    order = torch.randperm(scenes.tensor.shape[1], generator=torch.Generator().manual_seed(0))
+    shuffled = SceneBatch(scenes.tensor[:, order], scenes.scene_type)
+    apart = (corrections(shuffled, EVEN) - corrections(scenes, EVEN)[:, order]).norm(dim=-1)
+    assert float((apart < 1e-4).double().mean()) > 0.97  # ties, as of two sides of a cube, may be broken otherwise
+
+
+def test_nothing_leaves_the_device_but_lengths_of_lists(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes = noisy("restaurant_low_clutter", 2, 4)
+    corrections(scenes, EVEN)  # the geometry is built once
+
+    def refused(self: torch.Tensor, *_: object) -> None:
+        raise AssertionError(f"a tensor of shape {tuple(self.shape)} left its device")
+
+    for name in ("cpu", "numpy", "item", "__float__"):
+        monkeypatch.setattr(torch.Tensor, name, refused)
+    assert corrections(scenes, EVEN).any()
 
 
 def test_furniture_comes_apart_and_takes_along_what_is_on_it() -> None:
@@ -129,25 +150,23 @@ def test_furniture_comes_apart_and_takes_along_what_is_on_it() -> None:
     expected = torch.stack([-half, half, -half, half, 0 * half])
     torch.testing.assert_close(moves[1:6], expected, atol=CLEARANCE, rtol=0.0)
     assert not furniture_overlap(batch.with_poses(batch.translations + moves, batch.rotations)).any()
-    kept = after(batch, FLAT, np.arange(batch.tensor.shape[1])[None] != 1)  # observed furniture stays, with its post
+    kept = after(batch, FLAT, torch.arange(batch.tensor.shape[1])[None] != 1)  # observed furniture stays, with its post
     assert not kept[1].any()
     assert not kept[3].any()
     torch.testing.assert_close(kept[2], 2 * half, atol=2 * CLEARANCE, rtol=0.0)
 
 
 def test_the_moves_of_a_scene_do_not_depend_on_the_others() -> None:
-    real = get_grammar("dimsum_table").sample(np.random.default_rng(2), 20)
-    noise = 0.01 * torch.randn(real.translations.shape, generator=torch.Generator().manual_seed(0))
-    noisy = real.with_poses(real.translations + noise * real.is_free.unsqueeze(-1), real.rotations)
-    together = corrections(noisy, FLAT)
+    scenes = noisy("dimsum_table", 20, 2)
+    together = corrections(scenes, FLAT)
     for row in (0, 7, 19):
-        assert torch.equal(corrections(noisy[row : row + 1], FLAT)[0], together[row])
+        torch.testing.assert_close(corrections(scenes[row : row + 1], FLAT)[0], together[row], atol=1e-5, rtol=0.0)
 
 
 def test_only_the_ratios_of_the_deviations_matter() -> None:
     scene = boxes(("cube", 0.0, 0.0, 0.0), ("cube", SIDE - 0.02, 0.0, SIDE - 0.003))
     torch.testing.assert_close(after(scene, 100 * FLAT), after(scene, FLAT))
-    assert torch.isfinite(after(scene, np.zeros(3))).all()
+    assert torch.isfinite(after(scene, torch.zeros(3))).all()
 
 
 def test_a_heap_is_left_as_it_is_in_bounded_work() -> None:

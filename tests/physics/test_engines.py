@@ -66,6 +66,25 @@ def test_free_fall(engine: str) -> None:
 
 
 @engines
+def test_the_closed_form_of_falls_is_that_of_the_simulation(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Alone, as a stack that keeps its gap, and onto an object at rest, which is simulated with the falling one."""
+    batch = SceneBatch.concatenate([
+        scene(("cube", 0.0, 0.0, 1.0)),
+        scene(("cube", 0.0, 0.0, 1.0), ("post", 0.01, 0.0, 1.0 + SIDE + 5e-4), yaw=0.2),
+        scene(("cube", 0.0, 0.0, 0.0), ("post", 0.03, 0.0, SIDE + 0.02)),
+    ])  # fmt: skip
+    quick = equilibrium(batch, physics=engine)
+    way, work = physics_of(batch.scene_type, engine).engine.fall(0.1)
+    assert way == pytest.approx(0.5 * 9.81 * 0.01 * (1 + 1 / work), rel=1e-9)
+    assert quick.displacement[:2][batch[:2].is_free].tolist() == pytest.approx([way] * 3, rel=1e-6)
+    assert 0.019 < float(quick.displacement[2, 2]) < 0.03
+    monkeypatch.setattr(motion, "_falls", lambda objects, *_: np.zeros((2, len(objects)), dtype=bool))
+    slow = equilibrium(batch, physics=engine)
+    torch.testing.assert_close(quick.displacement, slow.displacement, atol=1e-6, rtol=0)
+    torch.testing.assert_close(quick.rotation, slow.rotation, atol=1e-6, rtol=0)
+
+
+@engines
 def test_what_stands_stays(engine: str) -> None:
     moved = simulated(scene(("cube", 0.2, 0.1, 0.0), ("bowl", -0.3, 0.0, 0.0), yaw=0.3), engine, 0.5)
     assert np.linalg.norm(moved.translation, axis=1).max() < 5e-5

@@ -111,9 +111,7 @@ def test_the_gripper_meets_what_is_deeper_than_a_tenth_of_a_millimetre() -> None
             part.setTransform(Transform(turn, place))
         found.append(any(map(tree.meets, body)))
         turns, at = np.concatenate([turn[None], rotations[owner]]), np.concatenate([place[None], translations[owner]])
-        met = overlaps(kind, turns, at, kind > 0)
-        assert met is not None
-        deepest = met[2].max(initial=0.0)
+        deepest = overlaps(kind, turns, at, np.zeros_like(kind[1:]), kind[1:])[2].max(initial=0.0)
         assert TOUCHING < deepest < 3**0.5 * TOUCHING or found[-1] is bool(deepest > TOUCHING)
     assert 10 < sum(found) < 140
 

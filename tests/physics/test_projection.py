@@ -11,6 +11,7 @@ from scene_envs.assets import get_library
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import penetration, project, projection
 from scene_envs.physics import projection as planes
+from scene_envs.physics.collision import TOUCHING
 from scene_envs.physics.placement import Budget
 from scene_envs.rotations import yaw_matrix
 from scene_envs.scene import SceneBatch
@@ -94,7 +95,7 @@ def check_result(batch: SceneBatch, *, again: bool) -> bool:
     assert bool(result.batch.translations.isfinite().all())
     left = penetration(result.batch)
     if bool(left.valid):  # else a heap of too many parts to be measured one by one
-        assert float(result.residual_depth[0]) == pytest.approx(float(left.depth.max()), abs=1e-5)
+        assert float(result.residual_depth[0]) == pytest.approx(float(left.depth.max()), abs=TOUCHING)
     else:
         assert not bool(result.converged)
     assert bool(result.converged[0]) == (float(result.residual_depth[0]) <= projection.TOLERANCE)

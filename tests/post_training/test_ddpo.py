@@ -229,15 +229,11 @@ def test_keys_can_be_renamed() -> None:
     assert loss(batch.rename_key_("advantage", "credit"))["loss_objective"].item() == expected
 
 
-def test_weights_exclude_steps_below_the_floor_and_have_mean_one() -> None:
+def test_weights_exclude_steps_below_the_floor() -> None:
     stds = torch.tensor([0.6, 0.4, 0.2, 0.005, 0.0])
-    for weighting in ("uniform", "std", "variance"):
-        weights = gradient_weights(stds, min_std=1e-2, weighting=weighting)
-        assert weights[3:].tolist() == [0.0, 0.0]
-        assert float(weights[:3].mean()) == pytest.approx(1.0)
-    weights = gradient_weights(stds, weighting="variance")
-    assert float(weights[0] / weights[1]) == pytest.approx(2.25)
-    assert gradient_weights(stds, skip_first=0.4).tolist() == [0.0, 0.0, 1.0, 0.0, 0.0]
+    assert gradient_weights(stds, min_std=1e-2).tolist() == [1.0, 1.0, 1.0, 0.0, 0.0]
+    with pytest.raises(InvalidInputError, match=r"min_std=0\.7.* sigmas of the chain are \[0\.6, 0\.4"):
+        gradient_weights(stds, min_std=0.7)
 
 
 @pytest.mark.parametrize(
@@ -255,15 +251,8 @@ def test_timestep_of_another_chain_is_refused() -> None:
         DDPOSFLoss(DenoisingPolicy(LinearChain(THETA, SIGMAS), 3))(transitions(x, 17, x, x))
 
 
-def test_mean_baseline_by_hand() -> None:
-    # mean 3, population variance (9 + 1 + 1 + 9) / 4 = 5
-    reward = torch.tensor([0.0, 2.0, 4.0, 6.0])
-    expected = torch.tensor([-3.0, -1.0, 1.0, 3.0]) / 5**0.5
-    torch.testing.assert_close(compute_advantages(reward, baseline="mean"), expected)
-
-
 def test_leave_one_out_by_hand() -> None:
-    # the others' means are 4, 10/3, 8/3 and 2
+    # the others' means are 4, 10/3, 8/3 and 2; the population variance is (9 + 1 + 1 + 9) / 4 = 5
     reward = torch.tensor([0.0, 2.0, 4.0, 6.0])
     expected = (reward - torch.tensor([4.0, 10 / 3, 8 / 3, 2.0])) / 5**0.5
     torch.testing.assert_close(compute_advantages(reward), expected)
@@ -295,20 +284,15 @@ def test_no_valid_row_gives_zeros() -> None:
 
 def test_groups_have_their_own_statistics() -> None:
     reward = torch.tensor([0.0, 1.0, 100.0, 300.0])
-    ours = compute_advantages(reward, groups=torch.tensor([7, 7, 9, 9]), baseline="mean")
-    torch.testing.assert_close(ours, torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    ours = compute_advantages(reward, groups=torch.tensor([7, 7, 9, 9]))
+    torch.testing.assert_close(ours, torch.tensor([-2.0, 2.0, -2.0, 2.0]))
 
 
 def test_slots_share_one_baseline_and_scale() -> None:
     reward, valid = torch.tensor([[0.0, 2.0], [4.0, 6.0]]), torch.tensor([[False, True], [True, True]])
-    ours = compute_advantages(reward, valid, baseline="mean")
-    expected = torch.tensor([[0.0, -2.0], [0.0, 2.0]]) / (8 / 3) ** 0.5
+    ours = compute_advantages(reward, valid)
+    expected = torch.tensor([[0.0, -3.0], [0.0, 3.0]]) / (8 / 3) ** 0.5  # 2 less 5, and 6 less 3
     torch.testing.assert_close(ours, expected)
-
-
-def test_unknown_baseline_is_named() -> None:
-    with pytest.raises(InvalidInputError, match="median"):
-        compute_advantages(torch.zeros(2), baseline="median")
 
 
 def episodes(reward: Tensor, **entries: Tensor) -> TensorDict:

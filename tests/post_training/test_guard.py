@@ -39,7 +39,7 @@ def test_the_base_prior_measures_as_itself(tmp_path: Path) -> None:
     """The same prior has the same samples at every check, so nothing exceeds the base prior."""
     guard = trainer(tmp_path, **{"guard.limits.count": 0.0, "guard.limits.classifier": 0.0}).guard
     reading = guard.check(tiny_prior(), 5, reward=0.0)
-    assert reading.samples == guard.base_figures
+    assert reading.samples == guard.base_samples
     assert reading.beyond == ()
     assert not reading.kept  # no better than the base prior
     assert guard.last_samples is not None
@@ -69,7 +69,7 @@ def test_a_figure_beyond_its_limit_is_named_and_keeps_nothing(tmp_path: Path) ->
     with torch.no_grad():
         for parameter in other.parameters():
             parameter.add_(0.3 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
-    made.guard.base_figures["count_distance"] = -10.0  # whatever the samples are, they are further than that
+    made.guard.base_samples["count_distance"] = -10.0  # whatever the samples are, they are further than that
     made.guard.best_reward = made.guard.best_score = float("-inf")
     reading = made.guard.check(other, 2, reward=1.0)
     assert "count_distance" in reading.beyond

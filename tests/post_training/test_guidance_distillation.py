@@ -82,7 +82,7 @@ def test_targets_are_the_corrections_of_what_the_sampler_denoises(trainer: PostT
     with torch.no_grad():
         reverse: Any = prior.transition(found["scene"][:, step], step, table)
     std = position_std(prior, step, table)  # type: ignore[arg-type]
-    moves = corrections(prior.decode(reverse.denoised), std.double().numpy())
+    moves = corrections(prior.decode(reverse.denoised), std)
     expected = reverse.denoised[..., :POSE_FEATURES].clone()
     expected[..., TRANSLATION] += prior.normalizer.scale[TRANSLATION] * moves
     torch.testing.assert_close(states["denoised"], expected)

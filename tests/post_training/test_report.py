@@ -13,8 +13,8 @@ import torch
 from PIL import Image
 from rich.console import Console
 
-from agents.post_training import demo, post_train_and_compare
 from agents.post_training import learner as learned_rewards
+from agents.post_training import post_train_and_compare
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
 from agents.post_training.report import Page, Picture, Section, Tile, load_learned_rewards, measure_prior, write_report
@@ -130,12 +130,10 @@ def test_demonstration_end_to_end(tmp_path: Path, capfd: pytest.CaptureFixture[s
     with pytest.raises(TrainingError, match="the run 'feasible' ended with status 2"):
         run_demo(tmp_path / "refused", workers=0, runs={"feasible": wrong})
     assert "feasible: scene-envs: unknown" in capfd.readouterr().err
-    with forked_workers(demo):
+    with forked_workers():
         with pytest.raises(TrainingError, match="the run 'feasible' ended with status 2"):
             run_demo(folder, workers=0, scenes=2, num_steps=4, runs={**runs, "feasible": wrong})
-        metrics = run_demo(
-            folder, workers=0, scenes=2, num_steps=4, runs=runs
-        )  # finds the first run, which is finished
+        metrics = run_demo(folder, workers=0, scenes=2, num_steps=4, runs=runs)
     on_disk = json.loads((folder / "metrics.json").read_text())
     assert on_disk["runs"]["clutter"]["guard"]["ratio"] == metrics["runs"]["clutter"]["guard"]["ratio"]
     priors = {"base": tiny_prior(slots=6), **{name: ScenePrior.load(folder / name) for name in runs}}

@@ -199,7 +199,7 @@ def overlapping() -> SceneBatch:
 
 
 def test_moves_are_the_corrections_times_the_strength(overlapping: SceneBatch) -> None:
-    moves = corrections(overlapping, STD.double().numpy())
+    moves = corrections(overlapping, STD)
     for strength in (1.0, 0.5):
         shift = PhysicsGuidance(strength)(40, 50, lambda: overlapping, STD)
         assert shift is not None
@@ -231,7 +231,7 @@ def test_samples_have_more_feasible_objects(name: str) -> None:
         batch = prior.sample(12, num_steps=25, seed=2, physics_guidance=strength)
         share.append(float(feasibility(batch).feasible[batch.is_free].double().mean()))
     assert share[1] > share[0] + 0.05, share
-    assert share[1] > 0.85, share
+    assert share[1] > 0.8, share
 
 
 def test_without_guidance_no_bit_changes_and_with_it_welded_objects_stay() -> None:

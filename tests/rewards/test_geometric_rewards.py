@@ -16,7 +16,6 @@ from rewards import (
     CategoryCount,
     Clearance,
     Clutter,
-    Coverage,
     Diversity,
     Gate,
     Penetration,
@@ -38,7 +37,6 @@ SHELF = [
     "penetration",
     "stability",
     "category_count",
-    "coverage",
     "diversity",
     "feasible_share",
 ]
@@ -69,7 +67,7 @@ def outline_area(kind: str, asset: str) -> float:
 @pytest.mark.parametrize("scene_type", ["living_room_shelf"])
 def test_they_keep_the_contract_on_a_shelf(name: str, scene_type: str) -> None:
     clauses = check_reward(name, scene_type)
-    assert ("scores a scene the same alone and in a batch" in clauses) is (name not in ("coverage", "diversity"))
+    assert ("scores a scene the same alone and in a batch" in clauses) is (name != "diversity")
 
 
 # -- clutter ---------------------------------------------------------------------------------------
@@ -216,7 +214,7 @@ def test_a_wanted_gap_is_positive(wanted: float) -> None:
         Clearance(wanted=wanted)
 
 
-# -- kinds, coverage, diversity ----------------------------------------------------------------------
+# -- kinds, diversity --------------------------------------------------------------------------------
 
 
 def test_kinds_are_counted_in_the_workspace() -> None:
@@ -228,22 +226,6 @@ def test_kinds_are_counted_in_the_workspace() -> None:
     assert score(CategoryCount("fruit"), batch).per_object[0].tolist() == [0, 1, 1, 0, 0, 0, 0, 0]
     with pytest.raises(UnknownNameError, match="did you mean 'fruit'"):
         CategoryCount("fruits")(batch, RewardContext())
-
-
-def test_coverage_of_a_batch_is_the_mean_and_is_shared_fairly() -> None:
-    """Six assets that are not fixed times eight cells. Scene 0 has two pairs, one of them also in scene 1."""
-    both = SceneBatch.concatenate(
-        [
-            place(("teacup", -0.3, -0.3, 0.0), ("teacup", -0.2, -0.3, 0.0), ("teapot", 0.3, 0.3, 0.0)),
-            place(("teacup", -0.3, -0.3, 0.0)),
-        ]
-    )
-    output = score(Coverage((2, 2, 2)), both)
-    pairs = 6 * 8
-    assert output.value.tolist() == pytest.approx([2 * 1.5 / pairs, 2 * 0.5 / pairs])
-    assert output.value.mean().item() == pytest.approx(output.terms["batch_coverage"][0].item())
-    assert output.per_object[0].tolist() == pytest.approx([0, 0.5 / pairs, 0.5 / pairs, 2 / pairs, 0, 0, 0, 0])
-    assert score(Coverage((2, 2, 2)), both[1]).value.item() == pytest.approx(1 / pairs)
 
 
 def test_diversity_is_the_mean_distance_to_the_others() -> None:
@@ -259,8 +241,8 @@ def test_diversity_is_the_mean_distance_to_the_others() -> None:
 def test_composites_depend_on_the_batch_when_a_part_does() -> None:
     assert WeightedSum(["object_count", "diversity"]).depends_on_batch
     assert not WeightedSum(["object_count", "clutter"]).depends_on_batch
-    assert Gate("object_count", condition="coverage", threshold=0.0).depends_on_batch
-    assert len(check_reward({"name": "weighted_sum", "rewards": ["object_count", "coverage"]})) == 5
+    assert Gate("object_count", condition="diversity", threshold=0.0).depends_on_batch
+    assert len(check_reward({"name": "weighted_sum", "rewards": ["object_count", "diversity"]})) == 5
 
 
 def test_an_offset_is_added_to_the_value_of_a_sum(cups: SceneBatch) -> None:
@@ -274,7 +256,6 @@ def test_an_offset_is_added_to_the_value_of_a_sum(cups: SceneBatch) -> None:
     [
         lambda: Clutter(lines=0),
         lambda: Stability(scale=0.0),
-        lambda: Coverage((0, 1, 1)),
         lambda: CategoryCount([]),
         lambda: Penetration("shallow"),
     ],

@@ -5,6 +5,7 @@ import random
 import re
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -196,9 +197,9 @@ def worker():
 )
 def test_a_hostile_reward_costs_its_scenes_and_nothing_else(name, message, cups, worker):
     before = cups.tensor.clone()
-    worker.timeout = 20  # in which the one before may have to be replaced
+    worker.settings = replace(worker.settings, timeout=20)  # in which the one before may have to be replaced
     assert evaluate_reward(worker, cups, RewardContext(prompts=("honest", "honest"))).valid.tolist() == [True, True]
-    worker.timeout = 1 if "longer" in message else 20
+    worker.settings = replace(worker.settings, timeout=1 if "longer" in message else 20)
     started = time.monotonic()
     output = evaluate_reward(worker, cups, RewardContext(prompts=(name, name)))
     assert time.monotonic() - started < 30  # the limit, and the end of the process

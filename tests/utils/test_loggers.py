@@ -7,39 +7,36 @@ from pathlib import Path
 
 import pytest
 
-from agents.pretraining.trainer import TrainingLog
-from agents.utils.loggers import LOGGERS, make_logger
+from agents.utils.loggers import LOGGERS, RunLogger
 from scene_envs.errors import MissingDependencyError, UnknownNameError
 
 
 def test_csv_adds_nothing_to_the_log_of_the_run(tmp_path: Path) -> None:
-    log = TrainingLog(tmp_path, make_logger("csv", tmp_path))
-    log.write({"step": 5, "loss": 0.5, "seconds": 1.0})
-    log.also.close()
-    assert [path.name for path in tmp_path.iterdir()] == ["log.csv"]
-    assert (tmp_path / "log.csv").read_text().splitlines()[1] == "5,0.5,,,,1.0"
+    logger = RunLogger("csv", tmp_path)
+    logger.log({"loss": 0.5}, step=5)
+    logger.close()
+    assert not list(tmp_path.iterdir())
 
 
 def test_tensorboard_gets_every_figure_at_its_step(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    log = TrainingLog(tmp_path, make_logger("tensorboard", tmp_path))
+    logger = RunLogger("tensorboard", tmp_path)
     for step in (5, 10):
-        log.write({"step": step, "loss": 1.0 / step, "seconds": 0.5 * step})
-    log.also.close()
+        logger.log({"loss": 1.0 / step, "seconds": 0.5 * step}, step)
+    logger.close()
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert set(events.Tags()["scalars"]) == {"loss", "seconds"}
     assert [(event.step, event.value) for event in events.Scalars("loss")] == [
         (5, pytest.approx(0.2)),
         (10, pytest.approx(0.1)),
     ]
-    assert len((tmp_path / "log.csv").read_text().splitlines()) == 3
 
 
 def test_wandb_stays_on_disk(tmp_path: Path) -> None:
     pytest.importorskip("wandb")
-    logger = make_logger("wandb", tmp_path)
+    logger = RunLogger("wandb", tmp_path)
     logger.log({"reward": 1.0}, step=1)
     logger.close()
     assert list(tmp_path.glob("wandb/offline-run-*"))
@@ -49,9 +46,9 @@ def test_wandb_stays_on_disk(tmp_path: Path) -> None:
 def test_a_missing_package_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda package: None)
     with pytest.raises(MissingDependencyError, match=rf"logger={name} needs .*scene-envs\[{name}\]"):
-        make_logger(name, tmp_path)
+        RunLogger(name, tmp_path)
 
 
 def test_an_unknown_logger_is_named(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="did you mean 'tensorboard'"):
-        make_logger("tensorbord", tmp_path)
+        RunLogger("tensorbord", tmp_path)

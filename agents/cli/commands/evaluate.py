@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.cli.commands.scenes import check_files, draw, draw_scenes, load_prior
+from agents.cli.commands.scenes import draw, draw_scenes, load_prior
 from agents.cli.run_folder import Run
 from agents.configuration.composition import MEASURE_NAMES, DrawKeys, OutputKeys
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, unknown_name
 from scene_envs.files import with_digest, without_digest, write_text
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from agents.priors.prior import ScenePrior
     from scene_envs.scene import SceneBatch
 
 _SAMPLES, _PROMPTED = "scenes.safetensors", "prompted.safetensors"
-_NOT_PART = ("measures", "project", "fid_weights", "pictures", "workers", "device", "output")
+_NOT_PART = ("measures", "project", "pictures", "workers", "device", "output")
 """Keys that change no figure of a group."""
 _OF_PROMPTS = {"prompt_count", "guidance", "claim_guidance"}
 """Keys that change only the figures of the group ``prompts``."""
@@ -57,10 +54,9 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
         claim_guidance: strength with which samples are guided to the numbers and places that their prompts give, 0 for
             none.
         seed: seed of the samples, the real scenes and the classifiers.
-        measures: all, or some of layout, physics, ready, stability, fsd, novelty, prompts, classifier, renders, fid,
-            written as layout or [layout, physics].
+        measures: all, or some of layout, physics, ready, stability, fsd, novelty, prompts, classifier, renders, written
+            as layout or [layout, physics].
         project: include ready, the measures after projection and settling, in all.
-        fid_weights: file with the weights of an Inception-v3, for fid.
         pictures: number of samples in gallery.png; 0 draws none.
         output: folder for metrics.json, metrics.md, scenes.safetensors and gallery.png; the same command again measures
             only the missing groups.
@@ -73,7 +69,6 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
     claim_guidance: float = 0.0
     measures: Any = "all"
     project: bool = True
-    fid_weights: str = ""
     pictures: int = 16
 
     def __post_init__(self) -> None:
@@ -85,15 +80,8 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
 
 
 def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> list[str]:
-    """Names of groups, in their order.
-
-    Args:
-        measures: ``"all"``, a name, names joined by commas, or a list of names.
-        project: whether ``"all"`` includes ``ready``.
-
-    Raises:
-        UnknownNameError: a name that is no group.
-        InvalidInputError: no name, or something else than names.
+    """Names of groups, in their order, from ``"all"``, a name, names joined by commas, or a list of names; ``project``
+    says whether ``"all"`` includes ``ready``. An UnknownNameError for a name that is no group.
 
     >>> choose_measures("novelty, layout")
     ['layout', 'novelty']
@@ -121,8 +109,6 @@ def check(settings: EvaluateConfig) -> None:
             f"prompt_count={settings.prompt_count} must be from 2 to count={settings.count}, whose scenes the prompts "
             "are of; null takes all of them"
         )
-    if settings.fid_weights:
-        check_files(settings.fid_weights)
 
 
 def run(settings: EvaluateConfig, run: Run) -> None:
@@ -149,7 +135,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
         )
         run.log(results.notes[-1])
     samples = results.scenes(_SAMPLES, lambda: draw(prior, settings, settings.count, batch_size=settings.batch_size))
-    _draw(samples, settings.pictures, run)
+    draw_scenes(samples, settings.pictures, run, "gallery.png")
     asked = settings.measures.split(",") if isinstance(settings.measures, str) else settings.measures
     optional = "all" in [str(name).strip() for name in asked]
     with make_pool(settings.workers, physics=settings.physics) as pool:
@@ -161,7 +147,6 @@ def run(settings: EvaluateConfig, run: Run) -> None:
             else None,
             pool,
             settings.seed,
-            settings.fid_weights,
             settings.prompt_count,
         )
         for name in missing:
@@ -191,10 +176,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
 
 def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
     """The identity of the figures in ``metrics.json``, and the figures by group, without groups of which a part was
-    left out; both empty where there are none.
-
-    Raises:
-        CorruptFileError: the file is cut off, or was changed after it was written.
+    left out; both empty where there are none. A CorruptFileError if the file is cut off or was changed.
     """
     try:
         found = dict(json.loads(path.read_text(encoding="utf-8"))).get("evaluation")
@@ -213,14 +195,8 @@ def _read_figures(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, float
 class _Results:
     """Figures by group, written to ``metrics.json`` after each group, and the samples that they are of.
 
-    Figures in the folder are kept as far as they depend on the same ``identity``.
-
-    Args:
-        run: the run in whose folder they are.
-        identity: the keys, and the digest of the prior, on which the figures depend.
-
-    Raises:
-        InvalidInputError: the figures were measured with other keys; other keys of the prompts are allowed.
+    Figures in the folder of ``run`` are kept as far as they depend on the same ``identity``: keys, and the digest of
+    the prior. An InvalidInputError if they were measured with other keys; other keys of the prompts are allowed.
     """
 
     def __init__(self, run: Run, identity: dict[str, Any]) -> None:
@@ -234,11 +210,9 @@ class _Results:
         if not changed:
             return
         stale = [_PROMPTED] if changed & _OF_PROMPTS else []
-        if known and changed <= _OF_PROMPTS | {"fid_weights"}:
+        if known and changed <= _OF_PROMPTS:
             if stale and self.groups.pop("prompts", None) is not None:
                 run.say(f"{path} has other {' and '.join(sorted(changed & _OF_PROMPTS))}: measuring the prompts anew")
-            if "fid_weights" in changed:
-                self.groups.pop("fid", None)
         elif known and changed != {"digest"}:
             told = [f"{key} was {known.get(key)!r}, is {identity.get(key)!r}" for key in sorted(changed - {"digest"})]
             raise InvalidInputError(
@@ -289,19 +263,9 @@ def _identity(settings: EvaluateConfig, prior: ScenePrior) -> dict[str, Any]:
 
     keys = {key: value for key, value in vars(settings).items() if key not in _NOT_PART}
     keys["physics_guidance"] = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
-    if settings.fid_weights:
-        keys["fid_weights"] = hashlib.sha256(Path(settings.fid_weights).read_bytes()).hexdigest()[:16]
     return {**keys, "digest": prior_digest(prior)}
 
 
 def _prompted(prior: ScenePrior, settings: EvaluateConfig, prompts: list[str]) -> SceneBatch:
     guidance = {"guidance": settings.guidance, "claim_guidance": settings.claim_guidance}
     return draw(prior, settings, len(prompts), prompt=prompts, batch_size=settings.batch_size, **guidance)
-
-
-def _draw(samples: SceneBatch, count: int, run: Run) -> None:
-    """Draw ``gallery.png``, if there is geometry to draw."""
-    if not samples.scene_type.has_geometry:
-        run.log(f"no gallery: the assets of {samples.scene_type.name!r} have no geometry here")
-        return
-    draw_scenes(samples, count, run, "gallery.png")

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from agents.cli.commands.scenes import check_files
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DeviceKeys, named
+from scene_envs.arrays import resolve_device
 from scene_envs.errors import InvalidInputError
 
 POSITIONAL = ("checkpoint", "metadata")
@@ -70,7 +71,7 @@ def run(settings: ImportCheckpointConfig, run: Run) -> None:
     run.say("it reads prompts" if prior.conditional else "it is sampled without prompts")
     metrics = {"parameters": parameters, "trained_steps": prior.card["trained_steps"]}
     if settings.count > 0:
-        prior = prior.to(settings.device)
+        prior = prior.to(resolve_device(settings.device))
         batch = prior.sample(settings.count, num_steps=settings.num_steps, seed=settings.seed).to("cpu")
         batch.save(run.directory / "scenes.safetensors")
         metrics["mean_objects"] = float(batch.counts.double().mean())

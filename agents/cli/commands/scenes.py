@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
+from scene_envs.arrays import resolve_device
 from scene_envs.errors import InvalidInputError
-from scene_envs.files import is_file
 
 if TYPE_CHECKING:
     from agents.priors.prior import ScenePrior
@@ -21,15 +21,15 @@ _TILE = (400, 300)
 def check_files(*paths: str) -> None:
     """Refuse paths at which there is no file."""
     for path in paths:
-        if not is_file(Path(path)):
+        if not os.path.isfile(path):
             raise InvalidInputError(f"{path[:200]!r} is no file; name one that is there")
 
 
 def load_prior(settings: Any) -> ScenePrior:
-    """The prior that the keys ``prior`` and ``device`` name."""
+    """The prior that the keys ``prior``, ``device`` and ``precision`` name."""
     from agents.priors.prior import ScenePrior
 
-    return ScenePrior.load(settings.prior).to(settings.device)
+    return ScenePrior.load(settings.prior).to(resolve_device(settings.device)).with_precision(settings.precision)
 
 
 def draw(prior: ScenePrior, settings: DrawKeys, count: int, **keys: Any) -> SceneBatch:
@@ -86,7 +86,9 @@ def draw_scenes(batch: SceneBatch, count: int, run: Run, name: str, captions: li
     """A gallery of the first ``count`` scenes."""
     from scene_envs.render import gallery, render
 
-    if count < 1:
+    if count > 0 and not batch.scene_type.has_geometry:
+        run.log(f"no {name}: the assets of {batch.scene_type.name!r} have no geometry here")
+    if count < 1 or not batch.scene_type.has_geometry:
         return
     shown = batch[: min(count, len(batch))]
     if captions is None:

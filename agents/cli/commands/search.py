@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.run_folder import Run
-from agents.configuration.composition import DeviceKeys, ProgressKeys, RewardLimitKeys, composed, named
+from agents.configuration.composition import ProgressKeys, RewardLimitKeys, composed, named
 from agents.planning.settings import SearchConfig
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from scene_envs.progress import Progress
 
 
 @composed
 @dataclass
-class SearchKeys(SearchConfig, RewardLimitKeys, DeviceKeys, ProgressKeys):
+class SearchKeys(SearchConfig, RewardLimitKeys, ProgressKeys):
     """Inputs and output of a search.
 
     Attributes:
@@ -42,7 +40,6 @@ class SearchKeys(SearchConfig, RewardLimitKeys, DeviceKeys, ProgressKeys):
 def run(settings: SearchKeys, run: Run) -> None:
     """Search; the search writes its own metrics and pictures."""
     from agents.planning import run_search
-    from agents.priors.prior import ScenePrior
     from agents.utils.interrupts import Terminated
     from rewards.process import close_reward, is_foreign, run_reward
     from scene_envs.datasets import load_scenes
@@ -59,10 +56,9 @@ def run(settings: SearchKeys, run: Run) -> None:
             physics=settings.physics,
             **vars(settings.reward_limits),
         )
-    made = prior if settings.device == "cpu" else ScenePrior.load(prior).to(settings.device)
     with _search_progress(search.nfe_per_scene, settings.progress) as show:
         try:
-            outcome = run_search(made, objective, config=search, scenes=scenes, output=settings.output, progress=show)
+            outcome = run_search(prior, objective, config=search, scenes=scenes, output=settings.output, progress=show)
         finally:
             close_reward(objective)
     metrics = outcome.metrics

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, make_dataclass
+from functools import cached_property
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -39,21 +40,18 @@ class Algorithm(ABC):
         policy: reverse chain of the prior in training.
         advantage: module that writes the advantages which the loss reads; None where the scenes are not weighted.
         loss: torchrl loss whose gradient trains the prior.
+        average: averaged weights that are evaluated and saved; None evaluates and saves the weights in training.
     """
 
     policy: DenoisingPolicy
     advantage: TensorDictModuleBase | None = None
     loss: LossModule
+    average: WeightAverage | None = None
 
-    @property
+    @cached_property
     def sampling_policy(self) -> DenoisingPolicy:
-        """Policy that samples the scenes; the policy in training unless an algorithm keeps another."""
+        """Policy that samples the scenes; the policy in training unless an algorithm sets another."""
         return self.policy
-
-    @property
-    def average(self) -> WeightAverage | None:
-        """Averaged weights that are evaluated and saved; None evaluates and saves the weights in training."""
-        return None
 
     @abstractmethod
     def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
@@ -87,52 +85,56 @@ class AveragedSampler(Algorithm):
     :class:`~agents.utils.weight_average.WeightAverage`.
     """
 
+    average: WeightAverage
+
     def __init__(self, policy: DenoisingPolicy, *, sampler_decay: float, warm_up: float = 10.0) -> None:
         self.policy = policy
         self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
         self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
-        self._sampling_policy = DenoisingPolicy(
+        self.sampling_policy = DenoisingPolicy(
             self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance,
             claim_guidance=policy.claim_guidance, independent=False,
         )  # fmt: skip  # it needs no log-probabilities
-        self._average = WeightAverage(self.prior, sampler_decay, warm_up)
-
-    @property
-    def sampling_policy(self) -> DenoisingPolicy:
-        """The reverse chain of the copy that samples."""
-        return self._sampling_policy
-
-    @property
-    def average(self) -> WeightAverage:
-        """The weights of the copy that samples."""
-        return self._average
+        self.average = WeightAverage(self.prior, sampler_decay, warm_up)
 
     def end_iteration(self) -> None:
         """Move the copy towards the prior in training."""
-        self._average.update(self.prior)
-        self._average.copy_to(self.sampler)
+        self.average.update(self.prior)
+        self.average.copy_to(self.sampler)
 
     def return_to(self, prior: ScenePrior) -> None:
         """Sample with the weights of ``prior``, and begin their average anew."""
-        self._average = WeightAverage(prior, self._average.decay, self._average.warm_up)
-        self._average.copy_to(self.sampler)
+        self.average = WeightAverage(prior, self.average.decay, self.average.warm_up)
+        self.average.copy_to(self.sampler)
 
     def state(self) -> dict[str, Any]:
         """The weights of the copy, and the number of their updates."""
-        return {"sampler": self._average.tensors, "updates": self._average.updates}
+        return {"sampler": self.average.tensors, "updates": self.average.updates}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
-        self._average.restore(state["sampler"], state["updates"])
-        self._average.copy_to(self.sampler)
+        self.average.restore(state["sampler"], state["updates"])
+        self.average.copy_to(self.sampler)
+
+
+def accepted_keys(*names: str, **keys: str) -> type:
+    """Dataclass of the keys that a loss reads, for :class:`PlainLoss`: ``names`` under themselves, others as given."""
+    defaults = {**{name: name for name in (*names, "text", "text_mask")}, **keys}
+    return make_dataclass("_AcceptedKeys", [(name, NestedKey, key) for name, key in defaults.items()])
 
 
 class PlainLoss(LossModule):
-    """A torchrl loss whose gradient goes to the modules' own parameters, and which has no value estimator. Its accepted
-    keys have ``text`` and ``text_mask``.
+    """A torchrl loss whose gradient goes to the modules' own parameters, and which has no value estimator. A subclass
+    names its keys: ``default_keys = _AcceptedKeys = accepted_keys(...)``, and those that must be present, ``required``.
     """
 
     tensor_keys: Any
+    required: ClassVar[Sequence[str]]
+
+    @property
+    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
+        """Keys that must be present."""
+        return [getattr(self.tensor_keys, name) for name in self.required]
 
     @property
     def functional(self) -> bool:
@@ -157,36 +159,27 @@ class PlainLoss(LossModule):
         return found
 
 
-class GradientSum:
-    """Sum of the ``.grad`` of parts of a batch, each complete before it is added; a gradient that is there already is
-    the first part. The sum of two parts is the same, bit for bit, in one process as in two with one part each.
+def in_parts(parameters: Iterable[nn.Parameter], count: int, chunk: int | None) -> Iterator[slice]:
+    """Rows of ``count`` scenes, ``chunk`` at a time (None: all), to put the gradient of each part into ``.grad``. At
+    the end ``.grad`` has the sum of the parts and of what was there before. Each part is complete before it is added,
+    so the sum of two is the same, bit for bit, in one process as in two with one part each.
 
     >>> weight = nn.Parameter(torch.ones(1))
-    >>> total = GradientSum([weight])
-    >>> for factor in (2.0, 3.0):
-    ...     (factor * weight).sum().backward()
-    ...     total.add_part()
-    >>> total.write()
+    >>> for rows in in_parts([weight], count=4, chunk=2):
+    ...     (weight * torch.arange(4.0)[rows]).sum().backward()
     >>> weight.grad
-    tensor([5.])
+    tensor([6.])
     """
-
-    def __init__(self, parameters: Iterable[nn.Parameter]) -> None:
-        self._parameters = [p for p in parameters if p.requires_grad]
-        self._total: list[Tensor | None] = [None] * len(self._parameters)
-        self.add_part()
-
-    def add_part(self) -> None:
-        """Add ``.grad`` to the sum, and clear it."""
-        for index, parameter in enumerate(self._parameters):
-            before, gradient = self._total[index], parameter.grad
-            self._total[index] = before if gradient is None else gradient if before is None else before.add_(gradient)
+    trained = [p for p in parameters if p.requires_grad]
+    total = [p.grad for p in trained]
+    for start in range(0, count, chunk or count):
+        for parameter in trained:
             parameter.grad = None
-
-    def write(self) -> None:
-        """Put the sum into ``.grad``."""
-        for parameter, total in zip(self._parameters, self._total, strict=True):
-            parameter.grad = total
+        yield slice(start, min(start + (chunk or count), count))
+        for index, (before, gradient) in enumerate(zip(total, [p.grad for p in trained], strict=True)):
+            total[index] = before if gradient is None else gradient if before is None else before.add_(gradient)
+    for parameter, gradient in zip(trained, total, strict=True):
+        parameter.grad = gradient
 
 
 def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
@@ -195,7 +188,6 @@ def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
     return float(torch.stack(norms).norm()) if norms else 0.0
 
 
-BASELINES = ("leave_one_out", "mean")
 _MIN_STD = 1e-8
 
 
@@ -216,7 +208,6 @@ class Advantage(TensorDictModuleBase):
 
     Args:
         credit: ``"scene"``, ``"object"``, or ``"auto"`` for credit per object where there is ``per_object``.
-        baseline: baseline of :func:`compute_advantages`.
         clip: bound of :func:`compute_advantages`.
 
     Raises:
@@ -225,25 +216,23 @@ class Advantage(TensorDictModuleBase):
     >>> from tensordict import TensorDict
     >>> done = torch.tensor([[[False], [True]]]).expand(3, 2, 1)
     >>> reward = torch.tensor([0.0, 1.0, 5.0])[:, None, None] * done
-    >>> batch = Advantage(baseline="mean")(TensorDict({"next": {"reward": reward, "done": done}}, [3, 2]))
+    >>> batch = Advantage()(TensorDict({"next": {"reward": reward, "done": done}}, [3, 2]))
     >>> batch["advantage"][:, 0, 0]
-    tensor([-0.9258, -0.4629,  1.3887])
+    tensor([-1.3887, -0.6944,  2.0831])
     """
 
     in_keys = [("next", "reward"), ("next", "done")]  # noqa: RUF012  (torchrl reads lists)
     out_keys = ["advantage", "valid"]  # noqa: RUF012
 
-    def __init__(self, *, credit: str = "auto", baseline: str = "leave_one_out", clip: float = 5.0) -> None:
+    def __init__(self, *, credit: str = "auto", clip: float = 5.0) -> None:
         super().__init__()
-        self.credit, self.baseline, self.clip = credit, baseline, clip
+        self.credit, self.clip = credit, clip
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``out_keys``."""
         final = last_steps(tensordict)
         reward, valid = self.credited(final)
-        advantage = compute_advantages(
-            reward, valid, baseline=self.baseline, clip=self.clip, groups=prompt_groups(final)
-        )
+        advantage = compute_advantages(reward, valid, clip=self.clip, groups=prompt_groups(final))
         tensordict["advantage"] = at_all_steps(advantage, tensordict)
         tensordict["valid"] = at_all_steps(final_reward(final)[1], tensordict)
         return tensordict
@@ -338,67 +327,49 @@ def no_credit_per_object() -> InvalidInputError:
 
 
 def compute_advantages(
-    reward: Tensor,
-    valid: Tensor | None = None,
-    *,
-    baseline: str = "leave_one_out",
-    clip: float = 5.0,
-    groups: Tensor | None = None,
+    reward: Tensor, valid: Tensor | None = None, *, clip: float = 5.0, groups: Tensor | None = None
 ) -> Tensor:
     """(reward - baseline) / std, clipped; invalid rows get 0 and are left out of all statistics.
 
-    The std is the population's (divided by n) over the valid rows. The leave-one-out baseline of a row is
-    the mean of the *other* valid rows (Kool et al. 2019), which keeps the gradient unbiased; ``"mean"`` is the
-    mean of all. If ``torch.distributed`` runs, the rows of all workers count.
+    The std is the population's (divided by n) over the valid rows. The baseline of a row is the mean of the *other*
+    valid rows (leave-one-out, Kool et al. 2019), which keeps the gradient unbiased. If ``torch.distributed`` runs, the
+    rows of all workers count.
 
     Args:
         reward: (B,) or (B, K) floats; K columns (slots) share one baseline and one std.
         valid: (B,) or (B, K) bool; None takes all rows as valid.
-        baseline: ``"leave_one_out"`` or ``"mean"``.
         clip: largest absolute value of an advantage.
         groups: (B,) int64, such as an index of the prompt; statistics are taken within each group.
 
     Returns:
         float32 of the shape of ``reward``; zeros for a group with fewer than two valid entries or no spread.
 
-    >>> compute_advantages(torch.tensor([0.0, 1.0, 5.0]), torch.tensor([True, True, False]), baseline="mean")
-    tensor([-1.,  1.,  0.])
+    >>> compute_advantages(torch.tensor([0.0, 1.0, 5.0]), torch.tensor([True, True, False]))
+    tensor([-2.,  2.,  0.])
     """
-    if baseline not in BASELINES:
-        raise InvalidInputError(f"baseline={baseline!r} is not known; use one of {', '.join(BASELINES)}")
     if not clip > 0:
         raise InvalidInputError(f"advantage_clip={clip} must be positive")
-    taken = torch.ones_like(reward, dtype=torch.bool) if valid is None else _expand(valid, reward)
-    taken = taken & torch.isfinite(reward)
+    taken = torch.isfinite(reward)
+    if valid is not None:
+        taken = taken & (valid if valid.ndim == reward.ndim else valid[:, None])
     all_rewards, all_taken = gather_rows(reward), gather_rows(taken)
     if groups is None:
-        return _normalise(reward, taken, all_rewards[all_taken], baseline, clip)
+        return _normalise(reward, taken, all_rewards[all_taken], clip)
     all_groups = gather_rows(groups)
     advantage = torch.zeros_like(reward, dtype=torch.float32)
     for group in groups.unique():
         rows, in_group = groups == group, all_groups == group
         sample = all_rewards[in_group][all_taken[in_group]]
-        advantage[rows] = _normalise(reward[rows], taken[rows], sample, baseline, clip)
+        advantage[rows] = _normalise(reward[rows], taken[rows], sample, clip)
     return advantage
 
 
-def _normalise(reward: Tensor, taken: Tensor, sample: Tensor, baseline: str, clip: float) -> Tensor:
+def _normalise(reward: Tensor, taken: Tensor, sample: Tensor, clip: float) -> Tensor:
     """Advantages of ``reward`` against the valid rewards ``sample`` (M,)."""
-    count = sample.numel()
+    count, values = sample.numel(), sample.double()
     zeros = torch.zeros_like(reward, dtype=torch.float32)
-    if count < 2:
-        return zeros
-    values = sample.double()
-    std = values.std(unbiased=False)
-    if std <= _MIN_STD:
+    if count < 2 or (std := values.std(unbiased=False)) <= _MIN_STD:
         return zeros
     deviation = (torch.where(taken, reward, zeros).double() - values.mean()) / std
-    if baseline == "leave_one_out":  # r - mean of the others = (r - mean of all) n / (n - 1)
-        deviation = deviation * (count / (count - 1))
+    deviation = deviation * (count / (count - 1))  # r - mean of the others = (r - mean of all) n / (n - 1)
     return torch.where(taken, deviation.clamp(-clip, clip).float(), zeros)
-
-
-def _expand(valid: Tensor, reward: Tensor) -> Tensor:
-    while valid.ndim < reward.ndim:
-        valid = valid.unsqueeze(-1)
-    return valid.expand(reward.shape)

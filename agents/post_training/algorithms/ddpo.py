@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
-from tensordict.utils import NestedKey
 from torch import Generator, Tensor
 
-from agents.post_training.algorithms.base import Advantage, Algorithm, BatchGradient, GradientSum, PlainLoss
+from agents.post_training.algorithms.base import (
+    Advantage,
+    Algorithm,
+    BatchGradient,
+    PlainLoss,
+    accepted_keys,
+    in_parts,
+)
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
 from agents.post_training.settings import DDPOISSettings, DDPOSFSettings
 from agents.utils.process_group import ProcessGroup
@@ -37,20 +42,19 @@ class DDPOSFLoss(PlainLoss):
     by the number of random entries, as in the published code). It decides the scale of the gradient, and so the
     meaning of the coefficient of any other loss. Over rows the loss is always a mean, never over steps.
 
-    Accepted keys (``set_keys``):
-        scene: (B, N, D) float, x_t. Default ``"scene"``.
-        timestep: (B, 1) int64, t. Default ``"timestep"``.
-        action: (B, N, D) float, x_{t-1}. Default ``"action"``.
-        advantage: (B,) or (B, 1) float, or (B, N) for credit per slot. Default ``"advantage"``.
-        sample_log_prob: (B, N) float, log-probability per slot at sampling; read when clipping, and optional
-            without. Default ``"slot_log_prob"``.
-        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``. If
-            ``("next", valid)`` is present, as in the output of a collector, the whole episode of a scene that the
-            reward could not score is left out. Rows must then be transitions in order along the last dimension, and
-            ``("next", "done")`` marks where an episode ends.
-        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional, as the policy saw them. Default ``"text"``
-            and ``"text_mask"``.
-        prompt: (B, L) int64 token indices, optional, read where ``text`` is missing. Default ``"prompt"``.
+    Accepted keys (``set_keys`` renames them):
+        scene: (B, N, D) float, x_t.
+        timestep: (B, 1) int64, t.
+        action: (B, N, D) float, x_{t-1}.
+        advantage: (B,) or (B, 1) float, or (B, N) for credit per slot.
+        sample_log_prob: (B, N) float, log-probability per slot at sampling, by default under ``"slot_log_prob"``; read
+            when clipping, and optional without.
+        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. If ``("next", valid)`` is present, as
+            in the output of a collector, the whole episode of a scene that the reward could not score is left out. Rows
+            must then be transitions in order along the last dimension, and ``("next", "done")`` marks where an episode
+            ends.
+        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional, as the policy saw them.
+        prompt: (B, L) int64 token indices, optional, read where ``text`` is missing.
 
     Args:
         policy: policy that is optimised.
@@ -73,20 +77,10 @@ class DDPOSFLoss(PlainLoss):
     >>> loss["loss_objective"].backward()
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        scene: NestedKey = "scene"
-        timestep: NestedKey = "timestep"
-        action: NestedKey = "action"
-        advantage: NestedKey = "advantage"
-        sample_log_prob: NestedKey = "slot_log_prob"
-        valid: NestedKey = "valid"
-        text: NestedKey = "text"
-        text_mask: NestedKey = "text_mask"
-        prompt: NestedKey = "prompt"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
+    default_keys = _AcceptedKeys = accepted_keys(
+        "scene", "timestep", "action", "advantage", "valid", "prompt", sample_log_prob="slot_log_prob"
+    )
+    required = ("scene", "timestep", "action", "advantage")
     out_keys = ["loss_objective", "log_ratio", "clip_fraction"]  # noqa: RUF012  (torchrl reads lists)
     policy: DenoisingPolicy
     step_weights: Tensor
@@ -114,12 +108,6 @@ class DDPOSFLoss(PlainLoss):
         weights = torch.ones(len(policy)) if step_weights is None else step_weights.float()
         self.register_buffer("step_weights", weights)
         self._entries: dict[int, int] = {}
-
-    @property
-    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
-        """Keys that must be present."""
-        keys = self.tensor_keys
-        return [keys.scene, keys.timestep, keys.action, keys.advantage]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss of a batch of transitions; rows may be at different steps.
@@ -198,15 +186,9 @@ class DDPOSFLoss(PlainLoss):
 
 
 class DDPO(Algorithm):
-    """DDPO-SF, or DDPO-IS if given the settings of DDPO-IS (Black et al. 2024).
-
-    Args:
-        settings: settings of the algorithm.
-        policy: policy that is optimised.
-        stds: (S,) smallest sigma of every step, normalised units.
-
-    Attributes:
-        loss: loss of a batch of transitions; its ``step_weights`` (S,) say which steps enter the gradient.
+    """DDPO-SF, or DDPO-IS if given the settings of DDPO-IS (Black et al. 2024). The ``step_weights`` (S,) of its loss
+    say which steps of ``policy`` enter the gradient; they follow from ``stds`` (S,), the smallest sigma of every step,
+    normalised units.
     """
 
     loss: DDPOSFLoss
@@ -242,12 +224,9 @@ def accumulate_policy_gradient(
     """
     total, largest, clipped = 0.0, 0.0, 0.0
     valid = batch["valid"][:, -1, 0]
-    size = loss.policy.chunk or len(valid)
     processes = ProcessGroup.current()
     valid_count = max(1.0, processes.sum_numbers(int(valid.sum()))[0])
-    gradient = GradientSum(loss.policy.parameters())
-    for start in range(0, len(valid), size):
-        rows = slice(start, min(start + size, len(valid)))
+    for rows in in_parts(loss.policy.parameters(), len(valid), loss.policy.chunk):
         share = int(valid[rows].sum()) / valid_count  # turns a chunk's mean into its part of the batch's mean
         for step in steps if share else ():
             result = loss(batch[rows, step])
@@ -256,7 +235,5 @@ def accumulate_policy_gradient(
             total += float(objective.detach())
             largest = max(largest, float(result["log_ratio"]))
             clipped += float(result["clip_fraction"]) * share / len(steps)
-        gradient.add_part()
-    gradient.write()
     total, clipped = processes.sum_numbers(total, clipped)
-    return BatchGradient(total, {"log_ratio": processes.largest(largest), "clip_fraction": clipped})
+    return BatchGradient(total, {"log_ratio": max(processes.gather(largest)), "clip_fraction": clipped})

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from copy import deepcopy
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
@@ -18,8 +16,9 @@ from agents.post_training.algorithms.base import (
     AveragedSampler,
     BatchGradient,
     ForwardAdvantage,
-    GradientSum,
     PlainLoss,
+    accepted_keys,
+    in_parts,
 )
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import finished_scenes
@@ -44,18 +43,20 @@ class ForwardProcessLoss(PlainLoss):
     or one per slot. The network denoises every slot given the others, so an advantage per slot credits an object only
     for its own pose.
 
-    Accepted keys (``set_keys``):
-        scene: (B, N, D) float, finished scenes x_0 as the prior encodes them. Default ``"scene"``.
-        timestep: (B,) or (B, 1) int64, optional; without it, drawn as in pretraining. Default ``"timestep"``.
-        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. Default ``"valid"``.
-        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
-        advantage: (B,), (B, 1) or (B, N) float, for poses. Default ``"advantage"``.
+    Accepted keys (``set_keys`` renames them):
+        scene: (B, N, D) float, finished scenes x_0 as the prior encodes them.
+        timestep: (B,) or (B, 1) int64, optional; without it, drawn as in pretraining.
+        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean.
+        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional.
+        advantage: (B,), (B, 1) or (B, N) float, for poses.
         category_advantage: advantage for categories, of the same shapes, optional; without it categories have no
-            credit. Default ``"category_advantage"``.
+            credit.
 
     Args:
         prior: prior that is trained.
         sampler: prior that sampled the scenes, such as a slower copy of ``prior``; its weights get no gradient.
+        beta: strength, of the meaning that the subclass gives it; None for its default.
+        clip: c, the advantage at which a sample is fully good or bad.
         expectation: mean of the targets over own samples, trained by ``loss_expectation``; None takes o_old instead.
         generator: source of timesteps, noise and observed entries (CPU); None for torch's own.
 
@@ -63,30 +64,31 @@ class ForwardProcessLoss(PlainLoss):
         the scenes, or 0 without it; and detached ``distance`` (), the root mean square of o - o_old.
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        scene: NestedKey = "scene"
-        timestep: NestedKey = "timestep"
-        valid: NestedKey = "valid"
-        text: NestedKey = "text"
-        text_mask: NestedKey = "text_mask"
-        advantage: NestedKey = "advantage"
-        category_advantage: NestedKey = "category_advantage"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
+    default_keys = _AcceptedKeys = accepted_keys("scene", "timestep", "valid", "advantage", "category_advantage")
+    required = ("scene", "advantage")
     out_keys = ["loss_objective", "loss_expectation", "distance"]  # noqa: RUF012  (torchrl reads lists)
     prior: ScenePrior
+    default_beta: ClassVar[float]
+    least_beta: ClassVar[float] = 0.0
+    """Number that beta must exceed."""
 
     def __init__(
         self,
         prior: ScenePrior,
         sampler: ScenePrior,
         *,
+        beta: float | None = None,
+        clip: float = 1.0,
         expectation: Expectation | None = None,
         generator: Generator | None = None,
     ) -> None:
         super().__init__()
+        self.beta, self.clip = self.default_beta if beta is None else beta, clip
+        if not self.beta > self.least_beta:
+            why = ": below, a bad sample pushes without bound" if self.least_beta else ""
+            raise InvalidInputError(f"beta={self.beta} must be above {self.least_beta:g}{why}")
+        if not clip > 0:
+            raise InvalidInputError(f"clip={clip} must be positive")
         self.prior, self.generator = prior, generator
         self.expectation = expectation
         self._sampler = (sampler,)  # in a tuple: its parameters are not parameters of the loss
@@ -95,11 +97,6 @@ class ForwardProcessLoss(PlainLoss):
     def sampler(self) -> ScenePrior:
         """The prior that sampled the scenes."""
         return self._sampler[0]
-
-    @property
-    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
-        """Keys that must be present."""
-        return [self.tensor_keys.scene, self.tensor_keys.advantage]
 
     @abstractmethod
     def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
@@ -184,12 +181,8 @@ class NFTLoss(ForwardProcessLoss):
     the loss is r |o_plus - target|^2 + (1 - r) |o_minus - target|^2. Its minimum over o at one x_t is
     o_old + E[(2 r - 1) (target - o_old)] / beta. The step is thus at most the mean absolute error of o_old divided by
     beta. The category loss has the same form, with cross-entropies of the logits l_plus and l_minus. These combine
-    logits in the way that o_plus and o_minus combine outputs.
-
-    Args:
-        prior, sampler, expectation, generator: the arguments of :class:`ForwardProcessLoss`.
-        beta: strength; smaller values step further from the sampling policy.
-        clip: c, the advantage at which a sample is fully good or bad.
+    logits in the way that o_plus and o_minus combine outputs. Arguments are those of :class:`ForwardProcessLoss`;
+    smaller values of ``beta`` step further from the sampling policy.
 
     >>> from agents.priors.testing import tiny_prior
     >>> import torch
@@ -202,19 +195,7 @@ class NFTLoss(ForwardProcessLoss):
     >>> loss["loss_objective"].backward()
     """
 
-    def __init__(
-        self,
-        prior: ScenePrior,
-        sampler: ScenePrior,
-        *,
-        beta: float = 0.5,
-        clip: float = 1.0,
-        expectation: Expectation | None = None,
-        generator: Generator | None = None,
-    ) -> None:
-        super().__init__(prior, sampler, expectation=expectation, generator=generator)
-        _require_positive(beta=beta, clip=clip)
-        self.beta, self.clip = beta, clip
+    default_beta = 0.5
 
     def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
         """See :class:`ForwardProcessLoss`."""
@@ -239,29 +220,11 @@ class AWMLoss(ForwardProcessLoss):
     With a = clip(A / c, -1, 1), the loss of a continuous entry is a |o - target|^2 + beta |o - o_old|^2. This loss is
     bounded below for beta > 1. The loss of a category is a times its cross-entropy plus beta KL(p_old || p). For a bad
     sample it is bounded below if beta times p_old of the category exceeds -a. At o = o_old the gradient is that of
-    :class:`NFTLoss` divided by the beta of :class:`NFTLoss`.
-
-    Args:
-        prior, sampler, expectation, generator: the arguments of :class:`ForwardProcessLoss`.
-        beta: strength of the pull, above 1.
-        clip: c, the largest advantage.
+    :class:`NFTLoss` divided by the beta of :class:`NFTLoss`. Arguments are those of :class:`ForwardProcessLoss`;
+    ``beta`` is the strength of the pull.
     """
 
-    def __init__(
-        self,
-        prior: ScenePrior,
-        sampler: ScenePrior,
-        *,
-        beta: float = 2.0,
-        clip: float = 1.0,
-        expectation: Expectation | None = None,
-        generator: Generator | None = None,
-    ) -> None:
-        super().__init__(prior, sampler, expectation=expectation, generator=generator)
-        _require_positive(clip=clip)
-        if not beta > 1:
-            raise InvalidInputError(f"beta={beta} must be above 1: below, a bad sample pushes without bound")
-        self.beta, self.clip = beta, clip
+    default_beta, least_beta = 2.0, 1.0
 
     def continuous_loss(self, output: Tensor, old: Tensor, target: Tensor, advantage: Tensor) -> Tensor:
         """See :class:`ForwardProcessLoss`."""
@@ -327,15 +290,8 @@ class ForwardProcess(AveragedSampler):
     """Algorithm of NFT and AWM, which differ in their loss; see :class:`ForwardProcessLoss`.
 
     A slower copy of the prior in training, an average of its weights, samples the scenes. This copy is also evaluated
-    and saved.
-
-    Args:
-        settings: settings of the algorithm.
-        policy: policy that is optimised.
-        stds: sigmas of the reverse steps; not used.
-
-    Attributes:
-        expectation: copy of the denoiser that learns the mean of the samples; None for none.
+    and saved. ``expectation`` is a copy of the denoiser that learns the mean of the samples, None for none. The sigmas
+    ``stds`` are not used.
     """
 
     loss: ForwardProcessLoss
@@ -356,17 +312,15 @@ class ForwardProcess(AveragedSampler):
 
         With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
         """
-        x0 = self.prior.encode(finished_scenes(batch).to(self.prior.device))
+        x0 = self.prior.encode(finished_scenes(batch))
         scenes = batch.exclude("next", "timestep")[:, -1].set("scene", x0)
-        size, processes = self.policy.chunk or len(x0), ProcessGroup.current()
+        processes = ProcessGroup.current()
         valid = max(1.0, processes.sum_numbers(int(scenes["valid"].sum()))[0])
         everything, own = gather_rows(x0), processes.rows(processes.size * len(x0))
         draws = [self.prior.noised(everything, generator).rows(own) for _ in range(self.settings.draws)]
         total, squares = 0.0, 0.0
         learned = [] if self.expectation is None else self.expectation.trained
-        gradient = GradientSum([*self.prior.parameters(), *learned])
-        for start in range(0, len(x0), size):
-            rows = slice(start, start + size)
+        for rows in in_parts([*self.prior.parameters(), *learned], len(x0), self.policy.chunk):
             part = scenes[rows]
             share = int(part["valid"].sum()) / valid / self.settings.draws
             for noised in draws:
@@ -375,8 +329,6 @@ class ForwardProcess(AveragedSampler):
                 (objective + result["loss_expectation"] * share).backward()
                 total += float(objective.detach())
                 squares += share * float(result["distance"]) ** 2
-            gradient.add_part()
-        gradient.write()
         if self.expectation is not None:
             self.expectation.step()
         total, squares = processes.sum_numbers(total, squares)
@@ -401,9 +353,3 @@ class ForwardProcess(AveragedSampler):
 
 def _cross_entropy(logits: Tensor, category: Tensor) -> Tensor:
     return F.cross_entropy(logits.flatten(0, 1), category.flatten(), reduction="none").view(category.shape)
-
-
-def _require_positive(**values: float) -> None:
-    for name, value in values.items():
-        if not value > 0:
-            raise InvalidInputError(f"{name}={value} must be positive")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Generator, Tensor
 
-from agents.post_training.algorithms.base import AveragedSampler, BatchGradient, GradientSum, PlainLoss
+from agents.post_training.algorithms.base import AveragedSampler, BatchGradient, PlainLoss, accepted_keys, in_parts
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import text_of
 from agents.post_training.settings import GuidanceDistillationSettings
@@ -32,12 +30,12 @@ class GuidanceDistillationLoss(PlainLoss):
     For one reverse step, the loss of an entry is an upper bound of twice the KL divergence of the prior's step from the
     teacher's: both are normal with the same variance, which includes the error of the denoised entry.
 
-    Accepted keys (``set_keys``):
-        scene: (B, N, D) float, scenes x_t of a chain. Default ``"scene"``.
-        timestep: (B,) or (B, 1) int64, timesteps of these scenes. Default ``"timestep"``.
-        denoised: (B, N, 12) float, the teacher's estimate of the normalised poses of x_0. Default ``"denoised"``.
-        trained: (B, N) bool, optional, slots whose poses are trained; without it, all. Default ``"trained"``.
-        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional. Default ``"text"`` and ``"text_mask"``.
+    Accepted keys (``set_keys`` renames them):
+        scene: (B, N, D) float, scenes x_t of a chain.
+        timestep: (B,) or (B, 1) int64, timesteps of these scenes.
+        denoised: (B, N, 12) float, the teacher's estimate of the normalised poses of x_0.
+        trained: (B, N) bool, optional, slots whose poses are trained; without it, all.
+        text, text_mask: (B, L, W) tokens and (B, L) their mask, optional.
 
     Args:
         prior: prior that is trained.
@@ -53,28 +51,14 @@ class GuidanceDistillationLoss(PlainLoss):
     True
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        scene: NestedKey = "scene"
-        timestep: NestedKey = "timestep"
-        denoised: NestedKey = "denoised"
-        trained: NestedKey = "trained"
-        text: NestedKey = "text"
-        text_mask: NestedKey = "text_mask"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
+    default_keys = _AcceptedKeys = accepted_keys("scene", "timestep", "denoised", "trained")
+    required = ("scene", "timestep", "denoised")
     out_keys = ["loss_objective"]  # noqa: RUF012  (torchrl reads lists)
     prior: ScenePrior
 
     def __init__(self, prior: ScenePrior) -> None:
         super().__init__()
         self.prior = prior
-
-    @property
-    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
-        """Keys that must be present."""
-        return [self.tensor_keys.scene, self.tensor_keys.timestep, self.tensor_keys.denoised]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss of a batch of scenes of a chain."""
@@ -111,13 +95,8 @@ class GuidanceDistillation(AveragedSampler):
     the guidance has nothing to correct. Rotations are held at those that the copy denoises, and categories get no
     gradient. The reward is only reported.
 
-    Args:
-        settings: settings of the algorithm.
-        policy: policy that is optimised.
-        stds: sigmas of the reverse steps; not used.
-
     Attributes:
-        steps: steps of the chain at which the guidance moves objects.
+        steps: steps of the chain of ``policy`` at which the guidance moves objects; the sigmas ``stds`` are not used.
 
     Raises:
         InvalidInputError: the guidance acts at no step of the chain, or the assets have no geometry.
@@ -158,16 +137,13 @@ class GuidanceDistillation(AveragedSampler):
             for _ in range(draws)
         ]
         states = [self.corrected(batch, steps[processes.rows(count)]) for steps in chosen]
-        size, total = self.policy.chunk or own, 0.0
-        gradient = GradientSum(self.prior.parameters())
-        for start in range(0, own, size):
+        total = 0.0
+        for rows in in_parts(self.prior.parameters(), own, self.policy.chunk):
             for state in states:
-                part = state[start : start + size]
+                part = state[rows]
                 objective = self.loss(part)["loss_objective"] * (len(part) / count / draws)
                 objective.backward()
                 total += float(objective.detach())
-            gradient.add_part()
-        gradient.write()
         moved, objects = (float(sum(state[name].sum() for state in states)) for name in ("moved", "trained"))
         total, moved, objects = processes.sum_numbers(total, moved, objects)
         return BatchGradient(total, {"correction_mm": 1e3 * moved / max(1.0, objects)})

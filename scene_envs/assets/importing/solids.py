@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 import logging
-import os
 from collections.abc import Sequence
 from functools import lru_cache
 from importlib.util import find_spec
@@ -33,7 +32,7 @@ from scene_envs.assets.importing.mesh_files import (
 )
 from scene_envs.assets.shapes import Profile, box, convex_hull, mass_properties, solid, volume
 from scene_envs.errors import InvalidInputError, MissingDependencyError
-from scene_envs.files import replacing
+from scene_envs.files import cache_folder, replacing
 from scene_envs.workers import WorkerFailure, run_apart
 
 if TYPE_CHECKING:
@@ -133,15 +132,6 @@ def has_volume(points: Array) -> bool:
         return False
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[2] > 1e-6 * max(spread[0], 1e-300))
-
-
-def cache_folder() -> Path:
-    """Folder of cached decompositions: ``$SCENE_ENVS_CACHE``, else ``scene_envs`` in the user's cache folder."""
-    if chosen := os.environ.get("SCENE_ENVS_CACHE"):
-        return Path(chosen).expanduser()
-    if os.name == "nt" and (local := os.environ.get("LOCALAPPDATA")):
-        return Path(local) / "scene_envs" / "cache"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scene_envs"
 
 
 def convex_parts(

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import numpy as np
 import trimesh
 
@@ -24,6 +28,8 @@ _CONICAL_HULL = [(0.46, 0.0), (0.90, 0.38), (1.0, 0.74), (0.70, 1.0)]
 _AVOCADO = [(0.0, 0.02), (0.20, 0.005), (0.36, 0.0), (0.66, 0.04), (0.93, 0.21), (1.0, 0.38), (0.945, 0.53),
             (0.80, 0.70), (0.62, 0.85), (0.42, 0.955), (0.18, 1.0), (0.0, 0.985)]  # fmt: skip
 _AVOCADO_HULL = [(0.46, 0.0), (0.94, 0.19), (1.0, 0.42), (0.82, 0.70), (0.40, 1.0)]
+_LONG, _SHORT, _NARROW = (0.60, 0.36, 0.64), (0.68, 0.46, 0.70), (0.56, 0.38, 0.68)
+"""Necks of pears: radius at the start, radius near the top and height of the start, as shares of the fruit's."""
 # the cereal box, m
 _WIDTH, _DEPTH, _HEIGHT = 0.19, 0.06, 0.28
 _PRINT = 4e-4
@@ -62,9 +68,9 @@ def _stem(height: float, start: float, tip: float, lean: float, thickness: float
     return tube(path, [0.9 * thickness, 0.8 * thickness, 1.2 * thickness], _STEM, sides=6)
 
 
-def _tones(first: Color, last: Color, count: int = 5) -> list[Color]:
-    """Colours from ``first`` to ``last`` in even steps."""
-    mixed = np.linspace(first, last, count).round().astype(int)
+def _tones(first: Color, last: Color) -> list[Color]:
+    """Five colours from ``first`` to ``last`` in even steps."""
+    mixed = np.linspace(first, last, 5).round().astype(int)
     return [(int(r), int(g), int(b)) for r, g, b in mixed]
 
 
@@ -78,22 +84,23 @@ def _cheek(spread: float) -> Paint:
     return paint
 
 
-def _ripening(height: float) -> Paint:
+def _ripe(height: float) -> Paint:
     """Paint from the colour at the blossom end (0) to the colour at the stem (4)."""
     return lambda angle, z: np.clip(np.floor(5.0 * (z / height) + 0.0 * angle), 0, 4).astype(np.int64)
 
 
 def _pebbled(height: float) -> Paint:
-    """As :func:`_ripening`, with each cell shifted at random by at most one tone."""
+    """As :func:`_ripe`, with each cell shifted at random by at most one tone."""
 
     def paint(angle: Array, z: Array) -> Cells:
         turns = np.random.default_rng(7).integers(-1, 2, np.broadcast_shapes(angle.shape, z.shape))
-        return np.clip(_ripening(height)(angle, z) + turns, 0, 4)
+        return np.clip(_ripe(height)(angle, z) + turns, 0, 4)
 
     return paint
 
 
-def _apple(diameter: float, height: float, colors: list[Color], paint: Paint, *, conical: bool = False) -> Model:
+def _apple(diameter: float, height: float, low: Color, high: Color, paint: Paint, conical: bool = False) -> Model:
+    """An apple, round or with five lobes at a narrow lower end."""
     radius = diameter / 2.0
     part = solid(_scaled(_CONICAL_HULL if conical else _APPLE_HULL, radius, height), _SIDES)
 
@@ -105,42 +112,13 @@ def _apple(diameter: float, height: float, colors: list[Color], paint: Paint, *,
         return np.where(np.arange(len(z))[:, None] == 0, 3, paint(angle, z))
 
     profile = curve(_scaled(_CONICAL if conical else _ROUND, radius, height))
-    body = revolve(profile, [*colors, _CALYX], with_calyx, swell=lobes)
+    body = revolve(profile, [*_tones(low, high), _CALYX], with_calyx, swell=lobes)
     return Model(join(body, _stem(height, 0.80, 1.04, 0.003, 0.0013)), [part], [part])
 
 
-@asset_recipe("apple_gala", display_name="apple", mass=0.15, color=(236, 30, 70))
-def apple_gala() -> Model:
-    """A small red apple on a yellow ground."""
-    return _apple(0.066, 0.062, _tones((232, 190, 92), (196, 54, 46)), _cheek(1.0))
-
-
-@asset_recipe("apple_golden", display_name="apple", mass=0.17, color=(250, 215, 60))
-def apple_golden() -> Model:
-    """A yellow apple with a few green and brown specks."""
-    return _apple(0.070, 0.068, _tones((238, 212, 94), (216, 204, 84)), _ripening(0.068))
-
-
-@asset_recipe("apple_green", display_name="apple", mass=0.19, color=(140, 230, 40))
-def apple_green() -> Model:
-    """A green apple."""
-    return _apple(0.075, 0.070, _tones((162, 204, 82), (130, 182, 56)), _ripening(0.070))
-
-
-@asset_recipe("apple_red", display_name="apple", mass=0.21, color=(150, 10, 30))
-def apple_red() -> Model:
-    """A dark red apple, wide at the top, with five lobes below."""
-    return _apple(0.080, 0.080, _tones((170, 58, 46), (126, 18, 32)), _cheek(0.9), conical=True)
-
-
 def _pear(
-    diameter: float,
-    height: float,
-    neck: tuple[float, float, float],
-    colors: list[Color],
-    paint: Paint,
+    diameter: float, height: float, low: Color, high: Color, paint: Paint, neck: tuple[float, float, float]
 ) -> Model:
-    """A pear; ``neck`` is (radius at its start, radius near its top, height of its start), as fractions."""
     radius = diameter / 2.0
     begin, end, waist = neck
     belly = 0.58 * waist
@@ -153,56 +131,38 @@ def _pear(
         (0.5 + 0.5 * begin, 0.5 * (belly + waist) + 0.03), (begin, waist + 0.02), (end * 1.06, 0.89),
         (0.72 * end, 0.975), (0.30 * end, 1.0), (0.0, 0.985),
     ]  # fmt: skip
-    body = revolve(curve(_scaled(section, radius, height), 28), colors, paint)
+    body = revolve(curve(_scaled(section, radius, height), 28), _tones(low, high), paint)
     visual = join(body, _stem(height, 0.97, 1.028, 0.003, 0.0016))
     return Model(visual, [lower, upper], [hull_of([lower, upper])])
 
 
-@asset_recipe("pear_bosc", display_name="pear", mass=0.19, color=(170, 130, 20))
-def pear_bosc() -> Model:
-    """A brown pear with a long neck."""
-    return _pear(0.070, 0.100, (0.60, 0.36, 0.64), _tones((160, 112, 54), (194, 152, 84)), _ripening(0.100))
-
-
-@asset_recipe("pear_anjou", display_name="pear", mass=0.19, color=(190, 210, 110))
-def pear_anjou() -> Model:
-    """A green pear, egg-shaped, with a short neck."""
-    return _pear(0.068, 0.090, (0.68, 0.46, 0.70), _tones((196, 208, 104), (162, 184, 76)), _ripening(0.090))
-
-
-@asset_recipe("pear_red", display_name="pear", mass=0.20, color=(190, 40, 110))
-def pear_red() -> Model:
-    """A squat red pear with a narrow neck."""
-    return _pear(0.075, 0.085, (0.56, 0.38, 0.68), _tones((206, 112, 66), (150, 30, 44)), _cheek(0.8))
-
-
-def _avocado(diameter: float, height: float, colors: list[Color], paint: Paint, bumps: float) -> Model:
+def _avocado(diameter: float, height: float, low: Color, high: Color, paint: Paint, bumps: float) -> Model:
     part = solid(_scaled(_AVOCADO_HULL, diameter / 2.0, height), _SIDES)
 
     def pebbles(angle: Array, z: Array) -> Array:
         return 1.0 - bumps * (0.5 + 0.5 * np.cos(11.0 * angle + 400.0 * z) * np.cos(7.0 * angle - 900.0 * z))
 
     profile = curve(_scaled(_AVOCADO, diameter / 2.0, height), 26)
-    body = revolve(profile, colors, paint, segments=36, swell=pebbles)
+    body = revolve(profile, _tones(low, high), paint, segments=36, swell=pebbles)
     return Model(join(body, _stem(height, 0.97, 1.012, 0.0, 0.0028)), [part], [part])
 
 
-@asset_recipe("avocado_a", display_name="avocado", mass=0.22, color=(20, 110, 60))
-def avocado_a() -> Model:
-    """A smooth green avocado."""
-    return _avocado(0.065, 0.100, _tones((74, 100, 42), (104, 130, 62)), _ripening(0.100), 0.01)
+_FRUIT: tuple[tuple[str, float, Color, Callable[..., Model], tuple[Any, ...]], ...] = (
+    ("apple_gala", 0.15, (236, 30, 70), _apple, (0.066, 0.062, (232, 190, 92), (196, 54, 46), _cheek(1.0))),
+    ("apple_golden", 0.17, (250, 215, 60), _apple, (0.070, 0.068, (238, 212, 94), (216, 204, 84), _ripe(0.068))),
+    ("apple_green", 0.19, (140, 230, 40), _apple, (0.075, 0.070, (162, 204, 82), (130, 182, 56), _ripe(0.070))),
+    ("apple_red", 0.21, (150, 10, 30), _apple, (0.080, 0.080, (170, 58, 46), (126, 18, 32), _cheek(0.9), True)),
+    ("pear_bosc", 0.19, (170, 130, 20), _pear, (0.070, 0.100, (160, 112, 54), (194, 152, 84), _ripe(0.100), _LONG)),
+    ("pear_anjou", 0.19, (190, 210, 110), _pear, (0.068, 0.090, (196, 208, 104), (162, 184, 76), _ripe(0.090), _SHORT)),
+    ("pear_red", 0.20, (190, 40, 110), _pear, (0.075, 0.085, (206, 112, 66), (150, 30, 44), _cheek(0.8), _NARROW)),
+    ("avocado_a", 0.22, (20, 110, 60), _avocado, (0.065, 0.100, (74, 100, 42), (104, 130, 62), _ripe(0.100), 0.01)),
+    ("avocado_b", 0.20, (40, 60, 30), _avocado, (0.060, 0.095, (54, 50, 42), (74, 78, 52), _pebbled(0.095), 0.04)),
+    ("avocado_c", 0.33, (90, 140, 30), _avocado, (0.082, 0.120, (104, 140, 52), (146, 172, 84), _ripe(0.120), 0.01)),
+)
+"""Name, mass (kg) and class colour; shape, diameter and height (m), colours at the ends, their pattern, and details."""
 
-
-@asset_recipe("avocado_b", display_name="avocado", mass=0.20, color=(40, 60, 30))
-def avocado_b() -> Model:
-    """A small dark avocado with a pebbled skin."""
-    return _avocado(0.060, 0.095, _tones((54, 50, 42), (74, 78, 52)), _pebbled(0.095), 0.04)
-
-
-@asset_recipe("avocado_c", display_name="avocado", mass=0.33, color=(90, 140, 30))
-def avocado_c() -> Model:
-    """A large bright green avocado."""
-    return _avocado(0.082, 0.120, _tones((104, 140, 52), (146, 172, 84)), _ripening(0.120), 0.01)
+for _name, _mass, _color, _shape, _details in _FRUIT:
+    asset_recipe(_name, display_name=_name.partition("_")[0], mass=_mass, color=_color)(partial(_shape, *_details))
 
 
 @asset_recipe("cereal_box", display_name="cereal box", plural="cereal boxes", mass=0.45, color=(245, 135, 25))

@@ -1,36 +1,14 @@
 """Prompts that are true of a scene, with a parser and a checker."""
 
-from scene_envs.datasets.prompts.claims import (
-    Claim,
-    ClaimCheck,
-    NameCount,
-    ObjectCount,
-    PairCount,
-    Place,
-    PlaceCount,
-    PromptFacts,
-    Reference,
-    SideClaim,
-    SupportCount,
-)
+from scene_envs.datasets.prompts.claims import PromptFacts
 from scene_envs.datasets.prompts.facts import SceneFacts, Tolerances, scene_facts, viewer_axes
 from scene_envs.datasets.prompts.parser import parse_prompt
 from scene_envs.datasets.prompts.writer import KINDS, describe, describe_all
 
 __all__ = [
     "KINDS",
-    "Claim",
-    "ClaimCheck",
-    "NameCount",
-    "ObjectCount",
-    "PairCount",
-    "Place",
-    "PlaceCount",
     "PromptFacts",
-    "Reference",
     "SceneFacts",
-    "SideClaim",
-    "SupportCount",
     "Tolerances",
     "describe",
     "describe_all",

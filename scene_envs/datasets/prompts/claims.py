@@ -93,11 +93,6 @@ class ClaimCheck:
         """Whether the claim is true."""
         return self.expected == self.found
 
-    @property
-    def mismatch(self) -> int:
-        """Objects too many or too few."""
-        return abs(self.expected - self.found)
-
 
 @dataclass(frozen=True)
 class ObjectCount:
@@ -106,7 +101,6 @@ class ObjectCount:
     number: int
 
     def check(self, scene: SceneFacts) -> ClaimCheck:
-        """Compare with ``scene``."""
         return _count(self, self.number, scene, np.arange(scene.count))
 
 
@@ -118,7 +112,6 @@ class NameCount:
     number: int
 
     def check(self, scene: SceneFacts) -> ClaimCheck:
-        """Compare with ``scene``."""
         return _count(self, self.number, scene, scene.named(self.name))
 
 
@@ -131,7 +124,6 @@ class PlaceCount:
     place: Place
 
     def check(self, scene: SceneFacts) -> ClaimCheck:
-        """Compare with ``scene``."""
         members = scene.named(self.name)
         return _count(self, self.number, scene, members[self.place.holds(scene)[members]])
 
@@ -149,7 +141,6 @@ class SupportCount:
     landmark: Reference
 
     def check(self, scene: SceneFacts) -> ClaimCheck:
-        """Compare with ``scene``."""
         holder = self.landmark.resolve(scene)
         members = scene.named(self.name) if holder >= 0 else np.empty(0, dtype=np.int64)
         return _count(self, self.number, scene, members[holders(scene, self.inside)[members] == holder])
@@ -165,7 +156,6 @@ class PairCount:
     under: str
 
     def check(self, scene: SceneFacts) -> ClaimCheck:
-        """Compare with ``scene``."""
         members = scene.named(self.name)
         held = np.isin(holders(scene, self.inside)[members], scene.named(self.under))
         return _count(self, self.number, scene, members[held])
@@ -180,7 +170,6 @@ class SideClaim:
     landmark: Reference
 
     def check(self, scene: SceneFacts) -> ClaimCheck:
-        """Compare with ``scene``."""
         first, second = self.subject.resolve(scene), self.landmark.resolve(scene)
         there = [index for index in (first, second) if index >= 0]
         holds = len(there) == 2 and (
@@ -195,17 +184,14 @@ Claim = ObjectCount | NameCount | PlaceCount | SupportCount | PairCount | SideCl
 
 @dataclass(frozen=True)
 class PromptFacts:
-    """Claims of one prompt.
-
-    Attributes:
-        claims: Claims in the order of the text.
+    """Claims of one prompt, in the order of the text.
 
     >>> from scene_envs.datasets import parse_prompt, scene_facts
     >>> from scene_envs.scene import SceneBatch
     >>> (scene,) = scene_facts(SceneBatch.empty("dimsum_table", 1))
     >>> prompt = parse_prompt("A scene with a table and two cups.", "dimsum_table")
-    >>> prompt.holds(scene), prompt.score(scene), [check.mismatch for check in prompt.check(scene)]
-    (False, 0.5, [0, 2])
+    >>> prompt.holds(scene), prompt.score(scene), [check.found for check in prompt.check(scene)]
+    (False, 0.5, [1, 0])
     """
 
     claims: tuple[Claim, ...]
