@@ -16,8 +16,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from scene_envs.assets import Asset, import_report, load_library
-from scene_envs.assets.importing.mesh_files import Model, cut_polygons
-from scene_envs.assets.importing.robot_files import IGNORED, READ, read_sdf, read_urdf
+from scene_envs.assets.importing.mesh_files import FORMATS, Model, cut_polygons
+from scene_envs.assets.importing.robot_files import read_sdf, read_urdf
 from scene_envs.errors import CorruptFileError, InvalidInputError
 
 BOX = (0.2, 0.1, 0.04)
@@ -122,7 +122,7 @@ BIND = (
             "m",
             "its texture 'lost' is not there",
         ),
-        (MATERIAL.format(extra="", diffuse="<color>0.9 0.1 0.1 1</color>"), "lost", "material 'lost'"),
+        (MATERIAL.format(extra="", diffuse="<color>0.9 0.1 0.1 1</color>"), "lost", "materials cannot be read"),
         (
             '<library_images><image id="i"><init_from>lost.png</init_from></image></library_images>'
             + MATERIAL.format(
@@ -146,15 +146,14 @@ def test_a_broken_look_of_a_dae_costs_no_geometry(tmp_path: Path, looks: str, ta
         assert np.unique(asset.visual.visual.vertex_colors[:, :3], axis=0).tolist() == [[230, 26, 26]]
 
 
-def test_a_skin_has_the_pose_in_which_it_is_bound(tmp_path: Path) -> None:
+def test_a_skinned_mesh_is_named_and_other_meshes_are_read(tmp_path: Path) -> None:
     pytest.importorskip("collada")
-    skin = (
-        '<library_controllers><controller id="k"><skin source="#g"><bind_shape_matrix>0 -1 0 0 1 0 0 0 0 0 1 0 0 0 0 1'
-        "</bind_shape_matrix></skin></controller></library_controllers>"
+    skin = '<library_controllers><controller id="k"><skin source="#g"/></controller></library_controllers>'
+    nodes = '<instance_geometry url="#g"/><instance_controller url="#k"/>'
+    assert sizes(listed(tmp_path, "it.dae", dae(triangles(block()), block().vertices, more=skin, node=nodes))) == list(
+        BOX
     )
-    text = dae(triangles(block()), block().vertices, more=skin, node='<instance_controller url="#k"/>')
-    assert sizes(listed(tmp_path, "it.dae", text)) == [0.1, 0.2, 0.04]
-    assert "its skin is shown in the pose in which it is bound" in said(tmp_path)
+    assert "its skinned meshes are left out" in said(tmp_path)
 
 
 # -- polygons -------------------------------------------------------------------------------------
@@ -173,7 +172,7 @@ def channel(outline: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
     return points, [list(range(count)), list(range(count, 2 * count))[::-1], *sides]
 
 
-@pytest.mark.parametrize("kind", ["obj", "relative.obj", "off", "dae", "polygons.dae"])
+@pytest.mark.parametrize("kind", ["obj", "relative.obj", "off", "ply", "dae", "polygons.dae"])
 @pytest.mark.parametrize("shift", range(0, 8, 3))
 def test_concave_polygons_keep_their_area_and_mass(tmp_path: Path, kind: str, shift: int) -> None:
     """A U of 8 corners, begun at different ones: the closed form of its area and volume."""
@@ -187,10 +186,19 @@ def test_concave_polygons_keep_their_area_and_mass(tmp_path: Path, kind: str, sh
         if kind == "polygons.dae":
             inner = "".join(f"<p>{run}</p>" for run in runs)
             text = dae(f'<polygons count="{len(runs)}">{given}{inner}</polygons>', points)
-    elif kind == "off":
+    elif kind in ("off", "ply"):
         rows = [" ".join(map(str, [len(polygon), *polygon])) for polygon in polygons]
         rows = [*(" ".join(map(str, point)) for point in points.tolist()), *rows]
-        text = "\n".join([f"OFF\n{len(points)} {len(polygons)} 0", *rows])
+        head = f"OFF\n{len(points)} {len(polygons)} 0"
+        if kind == "ply":
+            head = "\n".join(
+                [
+                    f"ply\nformat ascii 1.0\nelement vertex {len(points)}",
+                    *(f"property double {axis}" for axis in "xyz"),
+                    f"element face {len(polygons)}\nproperty list uchar int vertex_indices\nend_header",
+                ]
+            )
+        text = "\n".join([head, *rows])
     else:
         offset = 1 if kind == "obj" else -len(points)
         faces = ["f " + " ".join(str(i + offset) for i in polygon) for polygon in polygons]
@@ -213,7 +221,7 @@ def test_polygons_of_any_shape_are_covered_once() -> None:
         x, y = star.T
         area = abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
         ring = np.column_stack([star, np.zeros(len(star))]) @ Rotation.random(rng=seed).as_matrix().T
-        (cut,) = cut_polygons(ring, np.arange(len(ring)), np.array([len(ring)]))
+        cut, _ = cut_polygons(ring, np.arange(len(ring)), np.array([len(ring)]))
         corners = ring[cut]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
         assert len(cut) == len(ring) - 2
@@ -299,8 +307,8 @@ def _as_glb(header: bytes, data: bytes) -> bytes:
     return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
 
 
-def test_a_node_with_a_camera_keeps_its_mesh_and_children(tmp_path: Path) -> None:
-    nodes = [{"camera": 0, "mesh": 0, "children": [1]}, {"mesh": 0, "translation": [0.2, 0, 0]}]
+def test_a_glb_has_the_nodes_of_its_scene(tmp_path: Path) -> None:
+    nodes = [{"mesh": 0, "children": [1, 2]}, {"mesh": 0, "translation": [0.2, 0, 0]}, {"camera": 0}]
     cameras = [{"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}]
     points = block().vertices[:, [0, 2, 1]].astype("<f4")
     header, data = gltf(points, block().faces, nodes=nodes, cameras=cameras)
@@ -324,6 +332,8 @@ BARE = {"componentType": 5126, "count": 8, "type": "VEC3"}
     [
         ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "KHR_draco_mesh_compression"),
         ({"extensionsRequired": ["EXT_meshopt_compression"]}, "EXT_meshopt_compression"),
+        ({"nodes": [{"mesh": 0, "camera": 0}]}, "a mesh below a camera"),
+        ({"scenes": []}, "no scene"),
         ({"nodes": INSTANCED}, "EXT_mesh_gpu_instancing"),
         ({"meshes": [{"primitives": [{**PRIMITIVE, "mode": 5}]}]}, "triangle strips or fans"),
         ({"meshes": [{"primitives": [{**PRIMITIVE, "mode": 6}]}]}, "triangle strips or fans"),
@@ -352,6 +362,7 @@ def test_what_a_gltf_holds_besides_its_geometry_is_named(tmp_path: Path) -> None
         extensionsUsed=["KHR_texture_transform", "VENDOR_thing", "KHR_materials_unlit"],
         animations=[],
         nodes=[{"mesh": 0, "skin": 0, "weights": [1.0]}],
+        skins=[],
         images=[{"uri": "lost.png"}],
     )
     text = said(tmp_path)
@@ -389,19 +400,19 @@ def test_bodies_apart_weigh_what_they_hold_whatever_way_they_face(tmp_path: Path
 
 
 @pytest.mark.parametrize("outer_reversed", [False, True])
-@pytest.mark.parametrize("inner", ["cavity", "filling"])
-def test_a_cavity_is_empty_and_a_body_inside_a_body_adds_nothing(
-    tmp_path: Path, outer_reversed: bool, inner: str
+@pytest.mark.parametrize("inner", [-1.0, 1.0])
+def test_a_cavity_is_empty_and_a_solid_in_a_solid_adds_its_mass(
+    tmp_path: Path, outer_reversed: bool, inner: float
 ) -> None:
+    """As in trimesh and MuJoCo; but these give the negative mass where all faces point inward."""
     outer, hole = (0.2, 0.16, 0.12), (0.12, 0.1, 0.08)
-    turned = outer_reversed != (inner == "cavity")
+    turned = outer_reversed != (inner < 0)
     whole = at(trimesh.creation.box(outer), reversed=outer_reversed) + at(trimesh.creation.box(hole), reversed=turned)
     asset = listed(tmp_path, "it.stl", whole.export(file_type="stl"))
-    left = 1.0 if inner == "cavity" else 0.0
-    assert asset.mass == pytest.approx(500 * (np.prod(outer) - left * np.prod(hole)), rel=1e-5)
-    expected = box_moments(outer, 500) - left * box_moments(hole, 500)
+    assert asset.mass == pytest.approx(500 * (np.prod(outer) + inner * np.prod(hole)), rel=1e-5)
+    assert asset.mass == pytest.approx(500 * abs(whole.volume), rel=1e-5)
+    expected = box_moments(outer, 500) + inner * box_moments(hole, 500)
     assert np.diag(asset.inertia) == pytest.approx(expected, rel=1e-4)
-    assert len(asset.fine) == 1
 
 
 def test_a_ball_in_a_cavity_counts_and_mixed_faces_are_turned(tmp_path: Path) -> None:
@@ -508,9 +519,7 @@ def test_automatic_inertia_fills_the_shape_with_its_density(
 def test_automatic_inertia_of_an_open_mesh_is_refused(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(2, 0.1)
     trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0.03]).export(tmp_path / "it.stl")
-    with pytest.raises(
-        InvalidInputError, match=r"it.stl: the mass of collision 1 of link 'l'.*not closed; give its mass"
-    ):
+    with pytest.raises(InvalidInputError, match=r"it.stl: collision 1 of link 'l'.*not closed; give a mass"):
         listed(tmp_path, "it.sdf", sdf("<mesh><uri>it.stl</uri></mesh>", '<inertial auto="true"/>'))
 
 
@@ -702,6 +711,10 @@ material: script shader lighting render_order ambient diffuse specular shininess
 elements that are left out as a whole; <heightmap>, <image>, <polyline> and <cone> are refused."""
 
 
+READ = {kind: {tag: names.split() for tag, names in FORMATS[kind]["read"].items()} for kind in ("URDF", "SDF")}
+LEFT_OUT = {kind: set(" ".join(FORMATS[kind]["left out"].values()).split()) for kind in ("URDF", "SDF")}
+
+
 def schema(kind: str) -> list[tuple[str, str]]:
     found, tag = [], ""
     for word in SCHEMAS[kind].split():
@@ -766,7 +779,7 @@ def unread(model: Model) -> str:
 
 @pytest.mark.parametrize("kind", ["URDF", "SDF"])
 def test_each_entry_of_the_schemas_is_read_or_left_out_on_purpose_or_named(tmp_path: Path, kind: str) -> None:
-    left_out = {name for names in IGNORED[kind].values() for name in names}
+    left_out = LEFT_OUT[kind]
     for tag, name in schema(kind):
         known = name in READ[kind].get(tag, []) or f"{name}*" in READ[kind].get(tag, [])
         if known:
@@ -808,7 +821,7 @@ def test_each_value_that_is_said_to_be_read_matters(tmp_path: Path, kind: str) -
                 continue
             parents = {child: parent for parent in root.iter() for child in parent}
             place = f"{element.tag}/{name}" if key else f"{parents[element].tag}/{element.tag}"
-            if place in {entry for names in IGNORED[kind].values() for entry in names}:
+            if place in LEFT_OUT[kind]:
                 continue
             if key:
                 element.set(key, "§")

@@ -19,10 +19,8 @@ from scene_envs.assets.importing.limits import seconds_left
 from scene_envs.assets.importing.mesh_files import (
     MESH_SUFFIXES,
     Color,
-    Inertial,
     Model,
     Shape,
-    collada_axes,
     heavier,
     merged_inertial,
     pose_of,
@@ -204,38 +202,35 @@ class Weight(NamedTuple):
 
 
 def weigh(
-    given: Inertial | None, parts: Sequence[ConvexPart], solid: Inertial, mass: float | None, density: float | None
+    given: MassProperties | None, parts: Sequence[ConvexPart], solid: MassProperties, entry: AssetEntry
 ) -> Weight:
     """Mass properties of an asset of these fine parts whose ``solid`` is given at 1 kg/m^3. Those ``given`` by the file
     are kept where they are possible; an inertia of zeros is missing. A user's ``mass`` (kg) keeps the file's
     distribution; a user's ``density`` (kg/m^3) fills the shape evenly.
     """
-
-    def even(mass: float) -> MassProperties:
-        return MassProperties(*dataclasses.astuple(heavier(solid, mass / solid.mass)))
-
-    if density is not None:
-        return Weight(even(density * solid.mass), (), ())
+    mass = entry.mass
+    if entry.density is not None:
+        return Weight(heavier(solid, entry.density), (), ())
     if given is None or given.mass <= 0:
         known = "inertia computed from the shape"
         if mass is None:
             known, mass = f"mass and {known} at {DEFAULT_DENSITY:g} kg/m^3", DEFAULT_DENSITY * solid.mass
         why = "the file gives none" if given is None else f"the file gives a mass of {given.mass:g} kg"
-        return Weight(even(mass), (f"{known}: {why}",), ())
+        return Weight(heavier(solid, mass / solid.mass), (f"{known}: {why}",), ())
     if mass is None:
         found = given.mass / solid.mass
         if not _POSSIBLE[0] <= found <= _POSSIBLE[1]:
             reason = f"the file's {given.mass:g} kg would be {found:.3g} kg/m^3"
             text = f"mass and inertia recomputed at {DEFAULT_DENSITY:g} kg/m^3: {reason}"
-            return Weight(even(DEFAULT_DENSITY * solid.mass), (), (text,))
+            return Weight(heavier(solid, DEFAULT_DENSITY), (), (text,))
         mass = given.mass
-    inertia = given.inertia * (mass / given.mass)
+    inertia, even = given.inertia * (mass / given.mass), heavier(solid, mass / solid.mass)
     notes: tuple[str, ...] = ()
     if not inertia.any():
-        inertia, notes = even(mass).inertia, ("inertia computed from the shape: the file gives none",)
-    wrong = why_impossible(inertia, given.center_of_mass, parts, even(mass))
+        inertia, notes = even.inertia, ("inertia computed from the shape: the file gives none",)
+    wrong = why_impossible(inertia, given.center_of_mass, parts, even)
     if wrong:
-        return Weight(even(mass), (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
+        return Weight(even, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
     return Weight(MassProperties(mass, given.center_of_mass, 0.5 * (inertia + inertia.T)), notes, ())
 
 
@@ -347,7 +342,7 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     if entry.welded is None and (entry.mass is not None or entry.density is not None):
         static = False
     given = merged_inertial(model.inertials) if model.inertials else None
-    weight = weigh(given, parts, solid, entry.mass, entry.density)
+    weight = weigh(given, parts, solid, entry)
     properties = mass_properties(parts, 0.0) if static else weight.properties
     if not static:
         notes += weight.notes
@@ -387,7 +382,8 @@ def _read(path: Path) -> Model:
         return read_urdf(path)
     if suffix == ".sdf":
         return read_sdf(path)
-    shape = Shape("mesh", (1.0, 1.0, 1.0), pose_of(np.zeros(3), collada_axes(path)), "the mesh", path)
+    shape = Shape("mesh", (1.0, 1.0, 1.0), np.eye(4), "the mesh", path)
+    shape = dataclasses.replace(shape, pose=pose_of(np.zeros(3), meshes_of(shape)[0].metadata["upright"]))
     return Model(visuals=(shape,), collisions=(shape,))
 
 
@@ -400,7 +396,7 @@ def _scaled(model: Model, entry: AssetEntry) -> Model:
         return dataclasses.replace(old, pose=pose, size=tuple(scale * s for s in old.size))
 
     inertials = tuple(
-        Inertial(i.mass * scale**3, scale * turn @ i.center_of_mass, scale**5 * turn @ i.inertia @ turn.T)
+        MassProperties(i.mass * scale**3, scale * turn @ i.center_of_mass, scale**5 * turn @ i.inertia @ turn.T)
         for i in model.inertials
     )
     notes = model.notes
@@ -438,11 +434,11 @@ def _diagonal(shapes: Sequence[Shape]) -> float:
 
 def _collide(
     shapes: Sequence[Shape], entry: AssetEntry, size: float, path: Path, notes: list[str], warnings: list[str]
-) -> tuple[list[ConvexPart], Inertial]:
+) -> tuple[list[ConvexPart], MassProperties]:
     """Fine parts of all shapes and their solid at 1 kg/m^3; adds remarks to ``notes`` and ``warnings``."""
     tolerance = min(_CONVEX * size, _MAX_CONVEX)
     parts: list[ConvexPart] = []
-    solids: list[Inertial] = []
+    solids: list[MassProperties] = []
     repeated = 0
     seen: set[bytes] = set()
     for shape in shapes:
@@ -467,7 +463,7 @@ def _collide(
         notes.append(f"{thin} of {len(parts)} parts thinner than 3 mm (the thinnest {1e3 * min(widths):.2g} mm)")
     if len(parts) > _MANY_PARTS:
         notes.append(f"{len(parts)} parts; physics will be slow, a larger `concavity` gives fewer")
-    return parts, merged_inertial(tuple(solids))
+    return parts, merged_inertial(solids)
 
 
 def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trimesh | None) -> Array:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import os
 import re
-import struct
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -24,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
 from scene_envs.assets.importing.limits import check_file, check_triangles, seconds_left
+from scene_envs.assets.shapes import MassProperties
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, SceneEnvsError
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 
 Color = tuple[int, int, int]
+Indices = NDArray[np.int64]
 Kind = Literal["mesh", "box", "cylinder", "sphere", "capsule", "ellipsoid"]
 MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 """Mesh files that can be read."""
@@ -50,9 +51,10 @@ _SAMPLES = np.array(
 ) / 4.0  # fmt: skip
 """Barycentric points (15, 3) at which a texture is read to colour a triangle."""
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_UPRIGHT = {"X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "Z_UP": np.eye(3)}
+FORMATS: dict[str, Any] = json.loads(Path(__file__).with_name("formats.json").read_text("utf-8"))
+"""What is read and left out of formats: children and @attributes of elements, those with a * any number of times."""
 _BEFORE_XML = re.compile(rb"\A(?:\s|\xef\xbb\xbf|<!--.*?-->)+(?=<\?xml\s)", re.DOTALL)
-_PATHS = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "SDF_PATH")
-"""Environment variables of ROS, ROS 2, Gazebo and SDFormat with folders of packages and models."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +71,7 @@ class Shape:
     color: Color | None = None  # colour (r, g, b) given by the model, or None
     is_convex: bool = False  # whether the model declares the mesh convex
     part: tuple[str, bool] | None = None  # the one object of a mesh file, and whether its box is centred at the origin
-
-
-@dataclass(frozen=True, eq=False)
-class Inertial:
-    """Mass (kg), centre of mass (3,) m and inertia (3, 3) kg m^2 about that centre, model axes."""
-
-    mass: float
-    center_of_mass: Array
-    inertia: Array
+    density: float | None = None  # kg/m^3, given by the model
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +80,7 @@ class Model:
 
     visuals: tuple[Shape, ...]  # shapes to draw
     collisions: tuple[Shape, ...]  # shapes for collisions
-    inertials: tuple[Inertial, ...] = ()  # inertials of the links that have one
+    inertials: tuple[MassProperties, ...] = ()  # inertials of the links that have one
     static: bool | None = None  # whether the model is fixed to the world; None when the file does not say
     notes: tuple[str, ...] = field(default=())  # choices of the reader that the file may not intend
 
@@ -103,19 +97,19 @@ def from_roll_pitch_yaw(angles: Array) -> Array:
     return np.asarray(Rotation.from_euler("xyz", angles).as_matrix())
 
 
-def moved_inertial(pose: Array, inertial: Inertial) -> Inertial:
+def moved_inertial(pose: Array, inertial: MassProperties) -> MassProperties:
     """The inertial of a link in the frame that ``pose`` (4, 4) maps to."""
     turn = pose[:3, :3]
     center = turn @ inertial.center_of_mass + pose[:3, 3]
-    return Inertial(inertial.mass, center, turn @ inertial.inertia @ turn.T)
+    return MassProperties(inertial.mass, center, turn @ inertial.inertia @ turn.T)
 
 
-def heavier(inertial: Inertial, factor: float) -> Inertial:
+def heavier(inertial: MassProperties, factor: float) -> MassProperties:
     """The inertial of the same body with ``factor`` times the density."""
-    return Inertial(inertial.mass * factor, inertial.center_of_mass, inertial.inertia * factor)
+    return MassProperties(inertial.mass * factor, inertial.center_of_mass, inertial.inertia * factor)
 
 
-def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
+def merged_inertial(inertials: Sequence[MassProperties]) -> MassProperties:
     """The inertial of several bodies joined to one: masses add, inertias by the parallel-axis theorem."""
     mass = sum(inertial.mass for inertial in inertials)
     weights = [inertial.mass / mass if mass > 0 else 1.0 / len(inertials) for inertial in inertials]
@@ -124,17 +118,17 @@ def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
     for inertial in inertials:
         arm = inertial.center_of_mass - center
         total += inertial.inertia + inertial.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    return Inertial(mass, center, total)
+    return MassProperties(mass, center, total)
 
 
 def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     """The triangle meshes of a file, in its axes and unit.
 
-    Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned to z up; the unit
-    that a COLLADA file names is applied, its up axis is not (:func:`collada_axes`). The metadata of each mesh hold its
-    ``names`` in the file, and ``notes`` on what is not loaded. Raises InvalidInputError (no such file, unknown format,
-    beyond the limits), CorruptFileError (unreadable, no triangles, not finite) and MissingDependencyError (COLLADA
-    without pycollada).
+    Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned to z up. Metadata
+    of each mesh are its ``names`` in the file, ``notes`` on what is not loaded, and the rotation ``upright`` (3, 3) of
+    the up axis that a COLLADA file names, which RViz, Gazebo and PyBullet do not apply inside a URDF, to z up. Raises
+    InvalidInputError (no such file, unknown format, beyond the limits), CorruptFileError (unreadable, no triangles, not
+    finite) and MissingDependencyError (COLLADA without pycollada).
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -176,6 +170,7 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     for mesh in pieces:
         mesh.vertices = mesh.vertices @ content.axes.T
         own = {str(mesh.metadata.get(key)) for key in ("name", "node")}
+        mesh.metadata["upright"] = content.upright
         mesh.metadata["names"] = own | content.names_of(str(mesh.metadata.get("name")))
         mesh.metadata["notes"] = tuple(f"{path.name}: {note}" for note in dict.fromkeys(content.notes))
     return pieces
@@ -187,7 +182,7 @@ class _Content:
     def __init__(self, path: Path) -> None:
         self.path, self.type = path, path.suffix.lower()[1:]
         self.data = path.read_bytes()
-        self.axes = np.eye(3)  # axes and unit of the file to those of its meshes
+        self.axes, self.upright = np.eye(3), np.eye(3)  # to the axes and unit of its meshes, and from these to z up
         self.notes: list[str] = []  # what is not loaded
         self.scales: list[float] = []  # of the geometries, in the order of trimesh; 1 where there are fewer
         self.names: dict[str, str] = {}  # of the objects of the file, by what trimesh begins their names with
@@ -198,15 +193,15 @@ class _Content:
 
         options: dict[str, Any] = {"obj": {"split_objects": True}, "dae": {"ignore_broken": False}}.get(self.type, {})
         resolver = trimesh.resolvers.FilePathResolver(str(self.path))
-        file = BytesIO(self.data)
-        file.name = self.path.name
         try:
-            with _whole_polygons() if self.type == "dae" else nullcontext():
-                scene = trimesh.load_scene(file, file_type=self.type, resolver=resolver, process=False, **options)
+            with patch("collada.polylist.Polylist.triangleset", _triangleset) if self.type == "dae" else nullcontext():
+                scene = trimesh.load_scene(BytesIO(self.data), self.type, resolver, process=False, **options)
         except Exception as error:
-            if self.type != "dae" or not _drop_broken_materials(self, error):
+            if self.type != "dae" or not _drop_looks(self, error):
                 raise
             return self.load()
+        for geometry in scene.geometry.values() if self.type == "ply" else ():
+            _cut_again(geometry)
         for geometry, scale in zip(scene.geometry.values(), self.scales, strict=False):
             geometry.vertices = geometry.vertices * scale
         return scene
@@ -224,51 +219,46 @@ class _Content:
                 self.notes.append(f"its {what} {name!r} is not there")
 
 
-def cut_polygons(points: Array, corners: NDArray[np.int64], counts: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Triangles of polygons of any shape: for each of ``counts`` corners, rows (T, 3) of positions in ``corners``,
-    which are rows of ``points`` (V, 3). Convex polygons are fans, others lose one ear after another.
+def cut_polygons(points: Array, corners: Indices, counts: Indices) -> tuple[Indices, Indices]:
+    """Triangles (T, 3) of polygons of any shape, as positions in ``corners``, which are rows of ``points`` (V, 3), and
+    their polygons (T,). A polygon has ``counts`` corners. Convex ones are fans, others lose one ear after another.
 
     >>> dart = np.array([[0.0, 0, 0], [2, 1, 0], [0, 2, 0], [1, 1, 0]])
-    >>> [triangles.tolist() for triangles in cut_polygons(dart, np.arange(4), np.array([4]))]
-    [[[3, 0, 1], [1, 2, 3]]]
+    >>> cut_polygons(dart, np.arange(4), np.array([4]))[0].tolist()
+    [[3, 0, 1], [1, 2, 3]]
     """
-    starts = np.cumsum(counts) - counts
-    cut: list[Any] = [np.zeros((0, 3), dtype=np.int64)] * len(counts)
-    for count in np.unique(counts[counts >= 3]).tolist():
-        chosen, at = np.flatnonzero(counts == count), np.arange(1, count - 1)
-        fan = np.column_stack([np.zeros_like(at), at, at + 1])
-        rings = points[corners[starts[chosen, None] + np.arange(count)]]  # (P, count, 3)
-        edges = np.roll(rings, -1, axis=1) - rings
-        turns = np.cross(np.roll(edges, 1, axis=1), edges)
-        normals = np.cross(rings - rings[:, :1], np.roll(rings, -1, axis=1) - rings[:, :1]).sum(axis=1)
-        bent = np.einsum("pki,pi->pk", turns, normals) <= 1e-9 * (normals**2).sum(axis=1)[:, None]
-        rows = starts[chosen, None, None] + fan
-        for index in np.flatnonzero(bent.any(axis=1)) if count > 3 else ():
-            rows[index] = starts[chosen[index]] + _ears(rings[index], normals[index])
-        for index, triangles in zip(chosen, rows, strict=True):
-            cut[index] = triangles
-    return cut
+    starts, at = np.cumsum(counts) - counts, np.arange(len(corners))
+    own = np.repeat(np.arange(len(counts)), counts)
+    after = np.where(at + 1 < (starts + counts)[own], at + 1, starts[own])
+    ring = points[corners]
+    arms, edges = ring - ring[starts[own]], ring[after] - ring
+    normals = np.stack([np.bincount(own, part, len(counts)) for part in np.cross(arms, arms[after]).T], axis=1)
+    turns = (np.cross(edges, edges[after]) * normals[own]).sum(axis=1)
+    bent = (turns <= 1e-9 * (normals**2).sum(axis=1)[own]) & (counts[own] > 3)
+    inner = (at > starts[own]) & (after > at)
+    rows, polygons = np.column_stack([starts[own], at, after])[inner], own[inner]
+    for index in np.unique(own[bent]):
+        first, last = np.searchsorted(polygons, (index, index + 1))
+        rows[first:last] = starts[index] + _ears(ring[starts[index] :][: counts[index]], normals[index])
+    return rows, polygons
 
 
-def _ears(ring: Array, normal: Array) -> NDArray[np.int64]:
+def _ears(ring: Array, normal: Array) -> Indices:
     """Triangles (n - 2, 3) of a polygon (n, 3) with its normal, ear after ear."""
     axis = int(np.abs(normal).argmax())
-    flat = ring[:, [(axis + 1) % 3, (axis + 2) % 3]] * [1.0, np.sign(normal[axis]) or 1.0]  # counterclockwise
+    flat = ring[:, (axis + 1) % 3] + 1j * ring[:, (axis + 2) % 3] * (np.sign(normal[axis]) or 1.0)  # counterclockwise
 
-    def side(a: Array, b: Array, c: Array) -> Array:  # above 0 where c lies left of a to b
-        return np.asarray((b[0] - a[0]) * (c[..., 1] - a[1]) - (b[1] - a[1]) * (c[..., 0] - a[0]))
+    def side(a: complex, b: complex, c: Any) -> Any:  # above 0 where c lies left of a to b
+        return (np.conj(b - a) * (c - a)).imag
 
-    tiny = 1e-9 * float(np.ptp(flat, axis=0).max()) ** 2
+    tiny = 1e-9 * float(np.abs(flat - flat[0]).max()) ** 2
     left, found = list(range(len(ring))), []
     while len(left) > 3:
-        ear = 0
-        for index in range(len(left)):
-            a, b, c = (flat[left[(index + step) % len(left)]] for step in (-1, 0, 1))
-            others = flat[left]
-            others = others[~(others[:, None] == [a, b, c]).all(axis=2).any(axis=1)]
+        for ear in (*range(len(left)), 0):
+            a, b, c = flat[left[ear - 1]], flat[left[ear]], flat[left[(ear + 1) % len(left)]]
+            others = np.setdiff1d(flat[left], (a, b, c))
             inside = (side(a, b, others) >= -tiny) & (side(b, c, others) >= -tiny) & (side(c, a, others) >= -tiny)
             if side(a, b, c) > tiny and not inside.any():
-                ear = index
                 break
         found.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
         del left[ear]
@@ -308,108 +298,88 @@ def _cut_faces(lines: list[str], path: Path) -> str:
             if key == "v":
                 points.append([float(word) for word in rest.split()[:3]])
         elif key == "f":
-            faces[number] = rest.partition("#")[0].split()
-            if "-" in rest:  # a relative index counts back from here
-                split = [zip(corner.split("/"), sizes.values(), strict=False) for corner in faces[number]]
-                faces[number] = [
-                    "/".join(str(size + 1 + int(word)) if word[:1] == "-" else word for word, size in corner)
-                    for corner in split
-                ]
+            lines[number], faces[number] = "", rest.partition("#")[0].split()
+            for at, corner in enumerate(faces[number] if "-" in rest else ()):  # a relative index counts back from here
+                split = zip(corner.split("/"), sizes.values(), strict=False)
+                place = [str(size + 1 + int(word)) if word[:1] == "-" else word for word, size in split]
+                faces[number][at] = "/".join(place)
     words = [corner for corners in faces.values() for corner in corners]
     index = np.array([int(word.partition("/")[0]) - 1 for word in words], dtype=np.int64)
     if index.min() < 0 or index.max() >= len(points):
         raise CorruptFileError(f"{path}: a face refers to vertex {index.max() + 1} of {len(points)}")
     counts = np.array([len(corners) for corners in faces.values()], dtype=np.int64)
-    for number, triangles in zip(faces, cut_polygons(np.array(points), index, counts), strict=True):
-        lines[number] = "\n".join("f " + " ".join(words[at] for at in row) for row in triangles.tolist())
+    numbers, found = list(faces), cut_polygons(np.array(points), index, counts)
+    for row, polygon in zip(found[0].tolist(), found[1].tolist(), strict=True):
+        lines[numbers[polygon]] += "f " + " ".join(words[at] for at in row) + "\n"
     return "\n".join(lines)
 
 
-_COLLADA_UNUSED = ("camera", "light", "force_field", "cameras", "lights", "animations", "controllers")
-
-
 def _prepare_dae(content: _Content) -> None:
-    """Skins as meshes in the pose in which they are bound; cameras, lights, animations and lines left out."""
+    """Unit and up axis; skins and lines left out, which trimesh does not read, and cameras, lights and animations."""
     root = _parsed(content.data, content.path)
     if (unit := root.find("asset/unit")) is not None:
         content.axes = np.eye(3) * positive(unit.get("meter", "1"), 1, content.path, "unit of the asset")[0]
+    content.upright = _UPRIGHT.get((root.findtext("asset/up_axis") or "").strip(), _Y_UP)
     images = [(i.text or "").strip() for i in root.findall("library_images/image//init_from")]
     known = {i.get(key) for key, tag in (("id", "image"), ("sid", "newparam")) for i in root.iter(tag)}
     images += [i.get("texture", "") for i in root.iter("texture") if i.get("texture") not in known]
     content.expect([image.removeprefix("file://") for image in images], "texture")
     content.names |= {geometry.get("id", ""): geometry.get("name", "") for geometry in root.iter("geometry")}
-    sources = {f"#{controller.get('id')}": controller[0] for controller in root.iter("controller") if len(controller)}
+    unused, named = FORMATS["COLLADA"].values()
     for parent in list(root.iter()):
         for child in list(parent):
-            if child.tag == "instance_controller":
-                content.notes.append("its skin is shown in the pose in which it is bound")
-                parent.remove(child)
-                node, skin, left = parent, child, dict(sources)
-                while (skin := left.pop(skin.get("url") or skin.get("source") or "", None)) is not None:  # type: ignore
-                    node = ElementTree.SubElement(node, "node")
-                    matrix = skin.findtext("bind_shape_matrix") or "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
-                    ElementTree.SubElement(node, "matrix").text = matrix
-                    child.tag, child.attrib = "instance_geometry", {"url": skin.get("source", "")}
-                node.append(child)
-            elif child.tag in ("lines", "linestrips", "ph"):
-                content.notes.append(f"its <{child.tag}> are left out")
-                parent.remove(child)
-            elif child.tag.removeprefix("instance_").removeprefix("library_") in _COLLADA_UNUSED:
+            kind = child.tag.removeprefix("instance_").removeprefix("library_")
+            if kind in named or kind in unused:
+                content.notes += [f"its {named[kind]} are left out"] if kind in named else []
                 parent.remove(child)
     content.data = ElementTree.tostring(root)
 
 
-@contextmanager
-def _whole_polygons() -> Iterator[None]:
-    """Context in which pycollada cuts concave polygons as :func:`cut_polygons` does, not as fans."""
-    from collada.polylist import Polylist
+def _triangleset(polygons: Any) -> Any:
+    """The triangles of polygons of pycollada, which itself cuts concave ones as fans."""
     from collada.triangleset import TriangleSet
 
-    def triangleset(self: Any) -> Any:
-        cut = np.concatenate(cut_polygons(self.vertex, self.vertex_index, np.asarray(self.vcounts)))
-        return TriangleSet(self.sources, self.material, self.index[cut].ravel(), self.xmlnode)
-
-    with patch.object(Polylist, "triangleset", triangleset):
-        yield
+    cut = cut_polygons(polygons.vertex, polygons.vertex_index, np.asarray(polygons.vcounts))[0]
+    return TriangleSet(polygons.sources, polygons.material, polygons.index[cut].ravel(), polygons.xmlnode)
 
 
-def _drop_broken_materials(content: _Content, error: Exception) -> bool:
-    """Leave out what pycollada cannot read of the looks of a COLLADA file; False when there is nothing of that kind."""
-    import collada
-
-    read = collada.Collada(BytesIO(content.data), ignore=[collada.common.DaeError])
-    good = {f"{kind}#{item.id}" for kind in ("image", "effect", "material") for item in getattr(read, f"{kind}s")}
-    root, broken = _parsed(content.data, content.path), []
-    for parent in list(root.iter()):
-        for child in list(parent):
-            kind, name = child.tag, child.get("id", "")
-            if kind == "instance_material":
-                kind, name = "material", child.get("target", "")[1:]
-            if kind in ("image", "effect", "material") and f"{kind}#{name}" not in good and parent.tag != "extra":
-                broken.append(f"{kind} {name!r}")
-                parent.remove(child)
-    if broken:
-        reason = " ".join(str(error).split())
-        content.notes.append(f"{', '.join(dict.fromkeys(broken))} cannot be read ({reason}); drawn without")
+def _drop_looks(content: _Content, error: Exception) -> bool:
+    """Leave out the materials of a COLLADA file, which pycollada cannot read; False when there are none."""
+    root = _parsed(content.data, content.path)
+    looks = ("library_images", "library_effects", "library_materials", "bind_material")
+    found = [(parent, child) for parent in root.iter() for child in parent if child.tag in looks]
+    for parent, child in found:
+        parent.remove(child)
+    if found:
+        content.notes.append(f"its materials cannot be read ({' '.join(str(error).split())}); drawn without")
         content.data = ElementTree.tostring(root)
-    return bool(broken)
+    return bool(found)
 
 
 def _prepare_off(content: _Content) -> None:
-    """Polygons cut into triangles."""
+    """The same mesh as an OBJ."""
     from trimesh.util import comment_strip, decode_text
 
-    words = comment_strip(decode_text(content.data)).split("OFF", 1)[-1].split("\n")
-    rows = [line.split() for line in words if line.strip()]
+    lines = comment_strip(decode_text(content.data)).split("OFF", 1)[-1].split("\n")
+    rows = [line.split() for line in lines if line.strip()]
     vertices, faces = int(rows[0][0]), int(rows[0][1])
-    points = np.array([row[:3] for row in rows[1 : vertices + 1]], dtype=np.float64)
-    found = [[int(word) for word in row[1 : int(row[0]) + 1]] for row in rows[vertices + 1 : vertices + faces + 1]]
-    counts = np.array([len(face) for face in found], dtype=np.int64)
-    corners = np.array([corner for face in found for corner in face], dtype=np.int64)
-    if (counts > 3).any() and 0 <= corners.min() <= corners.max() < vertices:
-        triangles = corners[np.concatenate(cut_polygons(points, corners, counts))]
-        text = [f"OFF\n{vertices} {len(triangles)} 0", *map(" ".join, rows[1 : vertices + 1])]
-        content.data = "\n".join([*text, *(f"3 {a} {b} {c}" for a, b, c in triangles.tolist())]).encode()
+    text = ["v " + " ".join(row[:3]) for row in rows[1 : vertices + 1]]
+    for row in rows[vertices + 1 : vertices + faces + 1]:
+        text.append("f " + " ".join(str(int(word) + 1) for word in row[1 : int(row[0]) + 1]))
+    content.type, content.data = "obj", "\n".join(text).encode()
+    _prepare_obj(content)
+
+
+def _cut_again(mesh: Any) -> None:
+    """Triangles of the polygons of a PLY, which trimesh cuts as fans."""
+    raw = mesh.metadata["_ply_raw"]
+    data = raw.get("face", {}).get("data")
+    names = data if isinstance(data, dict) else getattr(getattr(data, "dtype", None), "names", None) or ()
+    for name in [name for name in names if name.startswith("vertex_ind")]:
+        found = data[name] if isinstance(data, dict) else data[name]["f1"]
+        counts, corners = np.array([len(face) for face in found]), np.concatenate([*found]).astype(np.int64)
+        if (counts > 3).any() and len(mesh.vertices) == raw["vertex"]["length"] > corners.max():
+            mesh.faces = corners[cut_polygons(np.asarray(mesh.vertices), corners, counts)[0]]
 
 
 def _check_content(path: Path) -> None:
@@ -448,74 +418,43 @@ def _check_texture(mesh: Any, path: Path) -> None:
         )
 
 
-def collada_axes(path: Path) -> Array:
-    """(3, 3) rotation from the up axis that a COLLADA file names to z up. A URDF or SDF does not use it: RViz, Gazebo
-    and PyBullet take the coordinates of its meshes as they are. Identity for other files.
-    """
-    if path.suffix.lower() != ".dae":
-        return np.eye(3)
-    found = re.search(rb"<(?:\w+:)?up_axis>\s*(\w+)", path.read_bytes())
-    turns = {b"X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), b"Z_UP": np.eye(3)}
-    return turns.get(found[1] if found else b"", _Y_UP)
-
-
-_GLTF_LOOKS = ("KHR_materials_", "KHR_lights_", "KHR_texture_", "EXT_texture_", "KHR_xmp", "KHR_mesh_quantization")
-"""Beginnings of the names of glTF extensions that leave the geometry as it is, or are read."""
-_GLTF_STEPS = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535}
-"""Integers that stand for 1, by their component type."""
-
-
 def _prepare_gltf(content: _Content) -> None:
-    """Scales of quantised positions, cameras left out; geometry that trimesh does not read is refused by its name."""
+    """Scales of quantised positions, and what is not loaded; refuses by its name what trimesh does not read."""
     content.axes = _Y_UP
-    text, rest = content.data, b""
-    if content.type == "glb":
-        size = int.from_bytes(content.data[12:16], "little")
-        text, rest = content.data[20 : 20 + size], content.data[20 + size :]
-    header = json.loads(text)
-    accessors, nodes = header.get("accessors", []), header.get("nodes", [])
-    primitives = [primitive for mesh in header.get("meshes", ()) for primitive in mesh["primitives"]]
-    lacking = [name for name in header.get("extensionsRequired", ()) if not name.startswith(_GLTF_LOOKS)]
+    looks, lost = (tuple(names.split()) for names in FORMATS["glTF"].values())
+    size = int.from_bytes(content.data[12:16], "little")
+    header = json.loads(content.data[20 : 20 + size] if content.type == "glb" else content.data)
+    accessors, nodes, meshes = header.get("accessors", []), header.get("nodes", []), header.get("meshes", [])
+    primitives = [primitive for mesh in meshes for primitive in mesh["primitives"]]
+    lacking = [name for name in header.get("extensionsRequired", ()) if not name.startswith(looks)]
     lacking += [name for node in nodes for name in node.get("extensions", ()) if name == "EXT_mesh_gpu_instancing"]
     lacking += ["triangle strips or fans" for primitive in primitives if primitive.get("mode", 4) in (5, 6)]
     lacking += ["sparse accessors" for accessor in accessors if "sparse" in accessor]
+    lacking += ["a mesh below a camera" for node in nodes if "camera" in node and {"mesh", "children"} & {*node}]
+    lacking += ["no scene"] * (not header.get("scenes"))
     for primitive in primitives:
         position = accessors[primitive["attributes"]["POSITION"]]
         if "bufferView" not in position and "sparse" not in position:
             lacking += primitive.get("extensions") or ["meshes without data"]
-        step = _GLTF_STEPS[position["componentType"]] if position.get("normalized") else 1
+        step = np.iinfo("bBhH"[position["componentType"] - 5120]).max if position.get("normalized") else 1
         content.scales += [1.0 / step] * (primitive.get("mode", 4) in (0, 1, 4))
-        for key in ("NORMAL", "TEXCOORD_0"):  # trimesh takes integers as they are
-            if key in primitive["attributes"] and accessors[primitive["attributes"][key]]["componentType"] != 5126:
-                del primitive["attributes"][key]
-                content.notes += ["its quantised texture coordinates are not read"] * (key != "NORMAL")
+        uv = primitive["attributes"].get("TEXCOORD_0")
+        lacking += ["quantised texture coordinates"] * (uv is not None and accessors[uv]["componentType"] != 5126)
     if lacking:
         raise InvalidInputError(
             f"{content.path} holds {', '.join(dict.fromkeys(lacking))}, which cannot be read; export it without "
             "(compression and instancing are options of the exporter)"
         )
-    used = {*header.get("extensionsUsed", ())}
-    ignored = [n for n in used if n in ("KHR_texture_transform", "KHR_texture_basisu") or not n.startswith(_GLTF_LOOKS)]
-    ignored += ["animations"] * ("animations" in header) + ["skins"] * any("skin" in node for node in nodes)
-    ignored += ["morph targets"] * any(any(some.get("weights", ())) for some in [*nodes, *header.get("meshes", ())])
-    content.notes += [f"its {name} is not applied" for name in sorted(ignored)]
-    content.expect(
-        [i["uri"] for i in header.get("images", ()) if not i.get("uri", "data:").startswith("data:")], "texture"
-    )
-    content.names |= {mesh["name"]: mesh["name"] for mesh in header.get("meshes", ()) if "name" in mesh}
-    for node in nodes:
-        node.pop("camera", None)  # trimesh leaves out the mesh of such a node, and the place of its children
-    children = {child for node in nodes for child in node.get("children", ())}
-    roots = [index for index in range(len(nodes)) if index not in children]
-    scenes = header.setdefault("scenes", [{"nodes": roots}])
-    if apart := len({*roots} - {*scenes[header.get("scene", 0)].get("nodes", ())}):
+    used = {n for n in header.get("extensionsUsed", ()) if n in lost or not n.startswith(looks)}
+    used |= {what for key, what in (("animations", "animations"), ("skins", "skins")) if key in header}
+    used |= {"morph targets" for some in [*nodes, *meshes] if any(some.get("weights", ()))}
+    content.notes += [f"its {name} is not applied" for name in sorted(used)]
+    uris = [image.get("uri", "data:") for image in header.get("images", ())]
+    content.expect([uri for uri in uris if not uri.startswith("data:")], "texture")
+    content.names |= {mesh["name"]: mesh["name"] for mesh in meshes if "name" in mesh}
+    roots = {*range(len(nodes))} - {child for node in nodes for child in node.get("children", ())}
+    if apart := len(roots - {*header["scenes"][header.get("scene", 0)].get("nodes", ())}):
         content.notes.append(f"{apart} node(s) outside its scene are left out")
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    content.data = text
-    if content.type == "glb":
-        sizes = struct.pack("<III4s", 2, 20 + len(text) + len(rest), len(text), b"JSON")
-        content.data = b"glTF" + sizes + text + rest
 
 
 _PREPARED = {
@@ -720,19 +659,18 @@ def find_mesh(uri: str, path: Path, where: str) -> Path:
         for candidate in _places(scheme, Path(named.replace("\\", "/")), path.parent):
             if candidate.is_file():
                 return candidate.resolve()
-    more = f", a package above or beside it, or the folders of {', '.join(_PATHS)}" if scheme else ""
+    more = f", a package above or beside it, or the folders of {FORMATS['package paths']}" if scheme else ""
     raise InvalidInputError(f"{path}: {where} refers to the mesh {uri!r}, which does not exist in {path.parent}{more}")
 
 
 def _places(scheme: str, rest: Path, folder: Path) -> Iterator[Path]:
     """Files that a URI of this scheme and path may name, in the order of the search."""
     yield rest if scheme == "file" else folder / rest
-    if not scheme:
-        return
-    roots = [Path(root) for name in _PATHS for root in os.environ.get(name, "").split(os.pathsep) if root]
+    paths = [os.environ.get(name, "") for name in FORMATS["package paths"].split()] if scheme else []
+    roots = [Path(root) for path in paths for root in path.split(os.pathsep) if root]
     roots += [root / "share" for root in roots]  # a prefix of ROS 2
     yield from (root / rest for root in roots)
-    if scheme == "file":
+    if scheme not in ("package", "model"):
         return
     package, inside = rest.parts[0] if rest.parts else "", Path(*rest.parts[1:])
     above = (folder, *folder.parents)
@@ -740,9 +678,7 @@ def _places(scheme: str, rest: Path, folder: Path) -> Iterator[Path]:
     yield from (root / inside for root in roots if root.name == package)
     for parent in (*above, *roots):
         for manifest in (parent / "package.xml", *sorted(parent.glob("*/package.xml"))):
-            try:
-                if manifest.is_file() and (read_xml(manifest).findtext("name") or "").strip() == package:
+            with suppress(OSError, SceneEnvsError):
+                if (read_xml(manifest).findtext("name") or "").strip() == package:
                     yield manifest.parent / inside
-            except (OSError, SceneEnvsError):
-                continue
     yield folder / inside

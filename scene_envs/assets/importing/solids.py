@@ -22,7 +22,6 @@ from scene_envs.assets.fcl import Broadphase, convex, gap
 from scene_envs.assets.importing.limits import seconds_left, too_slow
 from scene_envs.assets.importing.mesh_files import (
     Color,
-    Inertial,
     Shape,
     bare,
     merged_inertial,
@@ -30,7 +29,7 @@ from scene_envs.assets.importing.mesh_files import (
     painted,
     read_mesh,
 )
-from scene_envs.assets.shapes import Profile, box, convex_hull, mass_properties, solid, volume
+from scene_envs.assets.shapes import MassProperties, Profile, box, convex_hull, mass_properties, solid, volume
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.files import cache_folder, replacing
 from scene_envs.workers import WorkerFailure, run_apart
@@ -54,7 +53,7 @@ _SNAP_DISTANCE = 0.015
 rebuilds surfaces that are not closed on a grid; moving the corners keeps flat faces flat."""
 _MAX_BODIES = 128
 """Largest number of bodies of one mesh that are decomposed one by one."""
-_NOTHING = Inertial(0.0, np.zeros(3), np.zeros((3, 3)))
+_NOTHING = MassProperties(0.0, np.zeros(3), np.zeros((3, 3)))
 _SEGMENTS = 16
 _CAP = np.radians(15.0)
 """Half angle of the flat faces at the poles of a ball, on which it can stand."""
@@ -136,15 +135,13 @@ def has_volume(points: Array) -> bool:
 
 def convex_parts(
     surface: trimesh.Trimesh, method: Method, tolerance: float, threshold: float, what: str
-) -> tuple[list[ConvexPart], Inertial, list[str], list[str]]:
-    """The convex parts of one bare mesh (m) and its solid at 1 kg/m^3, with notes and warnings; no parts when the mesh
-    spans no volume.
+) -> tuple[list[ConvexPart], MassProperties, list[str], list[str]]:
+    """The convex parts of one bare mesh (m), its solid at 1 kg/m^3, notes and warnings; none without volume.
 
     Closed bodies are taken one by one: those whose depth below their hull is at most ``tolerance`` (m) keep their
-    shape, concave ones are decomposed. A surface that is not closed is decomposed as a whole, and its parts are its
-    solid. ``threshold`` is CoACD's concavity, relative to the size of the body. ``"convex"`` takes one hull of the
-    whole mesh; ``"coacd"`` raises MissingDependencyError where a concave body needs CoACD, and ``"auto"`` then takes a
-    hull.
+    shape, concave ones are decomposed. An open surface is decomposed as a whole, and its parts are its solid.
+    ``threshold`` is CoACD's concavity, relative to the size of the body. ``"convex"`` takes one hull of the whole mesh;
+    ``"coacd"`` raises MissingDependencyError where a concave body needs CoACD, and ``"auto"`` then takes a hull.
     """
     if not len(surface.faces) or not has_volume(np.asarray(surface.vertices)):
         return [], _NOTHING, [f"{what} is flat and left out of the collision parts"], []
@@ -153,8 +150,8 @@ def convex_parts(
     parts: list[ConvexPart] = []
     pieces: list[Any] = list(surface.split(only_watertight=False))
     thick = [piece for piece in pieces if has_volume(np.asarray(piece.vertices))]
-    closed, is_closed = _oriented(thick), _is_closed(thick)
-    bodies = [body for body in closed if body.volume > 0] if is_closed else thick
+    closed = _closed(thick)
+    bodies = [body for body in closed if body.volume > 0] or thick
     if method == "convex":
         parts, bodies = [_hull(surface.vertices, tolerance)], []
     elif not 0 < len(bodies) <= _MAX_BODIES or any(
@@ -176,45 +173,32 @@ def convex_parts(
                 "(`pip install 'scene-envs[decomposition]'`)"
             ]
         parts += [hull] if cut is None else [_hull(piece, tolerance) for piece in cut]
-    filled = mass_properties(parts, volume(parts))
-    solid = Inertial(filled.mass, filled.center_of_mass, filled.inertia)
-    return parts, _filled(closed) if is_closed else solid, notes, warnings
+    solid = closed or parts
+    return parts, mass_properties(solid, volume(solid)), notes, warnings
 
 
-def _is_closed(pieces: Sequence[trimesh.Trimesh]) -> bool:
-    """Whether all bodies have an inside, and none covers more than its hull holds."""
-    return bool(pieces) and all(
-        piece.is_watertight and 0 < abs(piece.volume) <= piece.convex_hull.volume * (1 + 1e-6) for piece in pieces
-    )
-
-
-def _oriented(pieces: Sequence[trimesh.Trimesh]) -> list[trimesh.Trimesh]:
-    """The closed ones among the bodies of a surface, facing outward whatever their file says, and their cavities facing
-    inward. A body inside another is a cavity if the file turns it the other way, else it fills what is full already.
+def _closed(pieces: Sequence[Any]) -> list[Any]:
+    """The bodies of a closed surface, the outermost ones facing outward, whatever way the file turns them, and what is
+    inside them turned with them, so that cavities face inward; none where a piece is open or covers more than its hull.
     """
     from trimesh.repair import fix_winding
 
-    bodies = sorted((p for p in pieces if p.is_watertight), key=lambda piece: -abs(piece.volume))
-    if not bodies:
-        return []
-    lows, highs = (np.array([body.bounds[end] for body in bodies]) for end in (0, 1))
-    signs: list[bool] = []
-    is_full: list[bool] = []
-    kept = []
+    for piece in pieces:
+        seconds_left()
+        if piece.is_watertight and not piece.is_winding_consistent:
+            fix_winding(piece)
+        if not piece.is_watertight or not 0 < abs(piece.volume) <= ConvexHull(piece.vertices).volume * (1 + 1e-6):
+            return []
+    bodies = sorted(pieces, key=lambda piece: -abs(piece.volume))
+    bounds = np.array([body.bounds for body in bodies]).reshape(-1, 2, 3)
+    inward = [body.volume < 0 for body in bodies]
     for at, body in enumerate(bodies):
         seconds_left()
-        if not body.is_winding_consistent:
-            fix_winding(body)
-        signs.append(bool(body.volume > 0))
-        near = np.flatnonzero(((lows[:at] <= lows[at]) & (highs[:at] >= highs[at])).all(axis=1)).tolist()
-        around = next((index for index in reversed(near) if _holds(bodies[index], body)), None)
-        turned = around is None or signs[around] != signs[at]
-        is_full.append(turned != (around is not None and is_full[around]))
-        if turned:
-            kept.append(body if signs[at] == is_full[at] else body.copy())
-            if signs[at] != is_full[at]:
-                kept[-1].invert()
-    return kept
+        inside = ((bounds[:at, 0] <= bounds[at, 0]) & (bounds[:at, 1] >= bounds[at, 1])).all(axis=1)
+        outer = next((index for index in np.flatnonzero(inside) if _holds(bodies[index], body)), at)
+        if inward[outer]:
+            body.invert()
+    return bodies
 
 
 def _holds(outer: trimesh.Trimesh, inner: trimesh.Trimesh) -> bool:
@@ -225,15 +209,6 @@ def _holds(outer: trimesh.Trimesh, inner: trimesh.Trimesh) -> bool:
     dots = (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
     turns = np.arctan2((a * np.cross(b, c)).sum(-1), la * lb * lc + dots).sum(axis=1) / (2 * np.pi)
     return bool((np.abs(turns) > 0.5).all())
-
-
-def _filled(bodies: Sequence[trimesh.Trimesh]) -> Inertial:
-    """The solid of closed bodies and cavities at 1 kg/m^3."""
-    import trimesh
-
-    joined: Any = trimesh.util.concatenate(list(bodies))
-    solid = joined.mass_properties
-    return Inertial(float(solid.volume), np.asarray(solid.center_mass), np.asarray(solid.inertia))
 
 
 def _hull(points: Array, tolerance: float) -> ConvexPart:
@@ -371,7 +346,7 @@ class Collision(NamedTuple):
     """Convex parts of one shape, the solid it fills at 1 kg/m^3, and remarks for the report."""
 
     parts: list[ConvexPart]
-    solid: Inertial
+    solid: MassProperties
     notes: list[str]
     warnings: list[str]
 
@@ -381,22 +356,19 @@ def _file(path: Path, changed: int) -> tuple[trimesh.Trimesh, ...]:
     return tuple(read_mesh(path))
 
 
+@lru_cache(maxsize=32)
 def meshes_of(shape: Shape) -> list[trimesh.Trimesh]:
-    """The meshes of a mesh shape in the model frame, colours kept; raises like :func:`read_mesh`, and InvalidInputError
-    for an object that its file does not hold.
+    """The meshes of a mesh shape in the model frame, colours kept, not to be changed; raises like :func:`read_mesh`,
+    and InvalidInputError for an object that its file does not hold.
     """
     assert shape.path is not None
-    changed = shape.path.stat().st_mtime_ns if shape.path.is_file() else 0
-    found = _file(shape.path, changed)
-    if shape.part is not None:
-        known = dict.fromkeys(name for mesh in found for name in mesh.metadata["names"])
-        found = tuple(mesh for mesh in found if shape.part[0] in mesh.metadata["names"])
-        if not found:
-            raise InvalidInputError(
-                f"{shape.path} holds no object {shape.part[0]!r}, the submesh of {shape.where}; its objects are "
-                f"{', '.join(map(repr, known)) or 'without names'}"
-            )
-    meshes: list[Any] = [mesh.copy() for mesh in found]
+    found = _file(shape.path, shape.path.stat().st_mtime_ns if shape.path.is_file() else 0)
+    meshes: list[Any] = [m.copy() for m in found if shape.part is None or shape.part[0] in m.metadata["names"]]
+    if shape.part is not None and not meshes:
+        known = ", ".join(sorted({repr(name) for mesh in found for name in mesh.metadata["names"]}))
+        raise InvalidInputError(
+            f"{shape.path} holds no object {shape.part[0]!r}, the submesh of {shape.where}; {known}"
+        )
     bounds = np.array([mesh.bounds for mesh in meshes])
     middle = 0.5 * (bounds[:, 0].min(axis=0) + bounds[:, 1].max(axis=0)) * bool(shape.part and shape.part[1])
     for mesh in meshes:
@@ -440,8 +412,7 @@ def collision_of(shape: Shape, method: Method, tolerance: float, threshold: floa
     if shape.kind != "mesh":
         part = _primitive(shape)
         part = ConvexPart(part.vertices @ shape.pose[:3, :3].T + shape.pose[:3, 3], part.faces)
-        filled = mass_properties([part], volume([part]))
-        return Collision([part], Inertial(filled.mass, filled.center_of_mass, filled.inertia), [], [])
+        return Collision([part], solid_of(shape), [], [])
     assert shape.path is not None
     result = Collision([], _NOTHING, [], [])
     solids = []
@@ -452,49 +423,39 @@ def collision_of(shape: Shape, method: Method, tolerance: float, threshold: floa
         result.parts.extend(parts)
         for kept, new in zip(result[2:], remarks, strict=True):
             kept.extend(remark for remark in new if remark not in kept)
-    return result._replace(solid=merged_inertial(tuple(solids)))
+    return result._replace(solid=merged_inertial(solids))
 
 
 def _surfaces(shape: Shape) -> list[trimesh.Trimesh]:
     """The bare meshes of a shape; one, where they are closed only together, as those of one body by material are."""
     import trimesh
 
-    apart = [bare(mesh) for mesh in meshes_of(shape)]
-    if len(apart) > 1 and not all(mesh.is_watertight for mesh in apart):
-        joined: Any = trimesh.util.concatenate(apart)
-        if (whole := bare(joined)).is_watertight:
-            return [whole]
-    return apart
+    apart: list[Any] = [bare(mesh) for mesh in meshes_of(shape)]
+    if all(mesh.is_watertight for mesh in apart):
+        return apart
+    whole = bare(trimesh.util.concatenate(apart))  # type: ignore[arg-type]
+    return [whole] if whole.is_watertight else apart
 
 
-def solid_of(shape: Shape) -> Inertial:
-    """The solid of a shape at 1 kg/m^3, in closed form for primitives. Raises InvalidInputError for a mesh that is not
-    closed.
-    """
+def solid_of(shape: Shape) -> MassProperties:
+    """The solid of a shape at 1 kg/m^3, in closed form for primitives; InvalidInputError for a mesh that is open."""
     if shape.kind == "mesh":
-        pieces = [piece for mesh in _surfaces(shape) for piece in mesh.split(only_watertight=False)]
-        if not _is_closed(pieces):
-            raise InvalidInputError(
-                f"{shape.path}: the mass of {shape.where} is to be computed from this mesh, which is not closed; give "
-                "its mass and inertia in the file"
-            )
-        return _filled(_oriented(pieces))
-    size = np.array(shape.size)
-    if shape.kind == "box":
-        mass = float(size.prod())
-        squares = mass * size**2 / 12.0
-        moments = squares.sum() - squares
-    elif shape.kind in ("sphere", "ellipsoid"):
-        radii = np.broadcast_to(size, 3)
-        mass = float(4.0 / 3.0 * np.pi * radii.prod())
-        moments = mass * ((radii**2).sum() - radii**2) / 5.0
-    else:
+        bodies = _closed([piece for mesh in _surfaces(shape) for piece in mesh.split(only_watertight=False)])
+        if not bodies:
+            raise InvalidInputError(f"{shape.path}: {shape.where} has no mass, as it is not closed; give a mass")
+        return mass_properties(bodies, volume(bodies))
+    if shape.kind in ("cylinder", "capsule"):
         radius, length = shape.size
         rod, ball = np.pi * radius**2 * length, 4.0 / 3.0 * np.pi * radius**3 * (shape.kind == "capsule")
-        side = rod * (3 * radius**2 + length**2) / 12.0
-        side += ball * (0.4 * radius**2 + 0.25 * length**2 + 0.375 * length * radius)
-        mass, moments = rod + ball, np.array([side, side, radius**2 * (0.5 * rod + 0.4 * ball)])
-    return moved_inertial(shape.pose, Inertial(mass, np.zeros(3), np.diag(moments)))
+        mass, side = rod + ball, radius**2 * (rod / 4.0 + ball / 5.0)
+        along = rod * length**2 / 12.0 + ball * (radius**2 / 5.0 + length**2 / 4.0 + 0.375 * length * radius)
+        squares = np.array([side, side, along])
+    else:
+        size = np.broadcast_to(shape.size, 3)
+        filled, share = (1.0, 12.0) if shape.kind == "box" else (4.0 / 3.0 * np.pi, 5.0)
+        mass = filled * float(size.prod())
+        squares = mass * size**2 / share
+    return moved_inertial(shape.pose, MassProperties(mass, np.zeros(3), np.diag(squares.sum() - squares)))
 
 
 def _primitive(shape: Shape) -> ConvexPart:
