@@ -1,9 +1,13 @@
-"""Exceptions of SceneEnvs; every message names the value, the place and the remedy."""
+"""Exceptions of SceneEnvs, whose messages name the value, the place and the remedy, and conditions on values."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, Any, get_type_hints
 
 
 class SceneEnvsError(Exception):
@@ -61,3 +65,71 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
     near = last or difflib.get_close_matches(name, names, n=1, cutoff=0.4)
     hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else "."
     return UnknownNameError(f"unknown {kind} {name!r}{hint} Known: {', '.join(names) or '(none)'}.")
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Condition on the value of a field; ``rule`` ends the message of the InvalidInputError. None is accepted."""
+
+    holds: Callable[[Any], bool]
+    rule: str
+
+    def check(self, place: str, name: str, value: Any, default: Any) -> None:
+        """Raise unless it holds for the field ``name``, whose ``default`` says whether null is a choice."""
+        if value is not None and not self.holds(value):
+            null = ", or null" if default is None else ""
+            raise InvalidInputError(f"{place}{name}={value} {self.rule}{null}")
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Condition that a field is one of the ``known`` words; the UnknownNameError calls it ``what`` or by its name."""
+
+    known: tuple[str, ...]
+    what: str = ""
+
+    def check(self, place: str, name: str, value: Any, default: Any) -> None:
+        """Raise unless the word is known."""
+        if value not in self.known:
+            raise unknown_name(self.what or name, str(value), self.known)
+
+
+def at_least(low: float) -> Limit:
+    """Condition of a finite number of at least ``low``."""
+    return Limit(lambda value: low <= value < math.inf, f"must be at least {low}")
+
+
+FINITE = Limit(math.isfinite, "must be a finite number")
+BELOW_ONE = Limit(lambda value: 0 <= value < 1, "must lie in [0, 1)")
+POSITIVE = Limit(lambda value: 0 < value < math.inf, "must be positive")
+Positive = Annotated[float, POSITIVE]
+Count = Annotated[int, at_least(1)]
+Natural = Annotated[int, at_least(0)]
+MaybeCount = Annotated[int | None, at_least(1)]
+Share = Annotated[float, Limit(lambda value: 0 <= value <= 1, "is outside 0..1: it is a share")]
+
+
+class Checked:
+    """Base of dataclasses whose fields have conditions in their annotations, which are checked when one is made.
+
+    >>> @dataclass
+    ... class Cup(Checked):
+    ...     sides: Count = 6
+    >>> Cup(sides=0)
+    Traceback (most recent call last):
+    ...
+    scene_envs.errors.InvalidInputError: sides=0 must be at least 1
+    """
+
+    place = ""
+    """What stands in front of the name of a field in messages."""
+
+    def __post_init__(self) -> None:
+        for name, condition in _conditions(type(self)):  # type: ignore[arg-type]
+            condition.check(self.place, name, getattr(self, name), getattr(type(self), name, ""))
+
+
+@cache
+def _conditions(kind: type) -> list[tuple[str, Limit | OneOf]]:
+    hints = get_type_hints(kind, include_extras=True)
+    return [(name, condition) for name, hint in hints.items() for condition in getattr(hint, "__metadata__", ())]

@@ -223,10 +223,10 @@ def test_another_search_in_the_folder_is_refused(prior: ScenePrior, tmp_path: Pa
         ({"num_steps": 0}, "num_steps=0 must be"),
         ({"slots": 1}, "slots=1: scenes of .* need at least 2 slots"),
         ({"planner": "beem"}, "did you mean 'beam'"),
-        ({"planner": {"name": "beam", "width": 0}}, "planner beam: width must be a number >= 1, got 0"),
+        ({"planner": {"name": "beam", "width": 0}}, "planner beam: width=0 must be at least 1"),
         ({"planner": {"name": "mcts", "rollout": "some"}}, "unknown rollout 'some'"),
-        ({"planner": {"name": "evolution", "crossover": 2}}, "planner evolution: crossover=2.0 is a probability"),
-        ({"planner": {"name": "feynman_kac", "begin": 1}}, "planner feynman_kac: begin=1.0 is a share"),
+        ({"planner": {"name": "evolution", "crossover": 2}}, "planner evolution: crossover=2.0 is outside 0..1"),
+        ({"planner": {"name": "feynman_kac", "begin": 1}}, "planner feynman_kac: begin=1.0 must lie in"),
         ({"mask": {"name": "empty", "cuont": 1}}, "did you mean 'count'"),
     ],
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from agents.configuration.composition import RewardLimitKeys, named
+from agents.configuration.composition import RewardLimitKeys, Seed, named
 
 WRITES = False
 
@@ -22,7 +22,7 @@ class CheckRewardConfig(RewardLimitKeys):
 
     reward: Any = named("object_count", "reward")
     scene: Any = named("dimsum_table", "scene")
-    seed: int = 0
+    seed: Seed = 0
 
 
 def run(settings: CheckRewardConfig) -> None:

@@ -9,7 +9,8 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 
 from agents.cli.run_folder import Run
-from agents.configuration.composition import DeviceKeys, ProgressKeys
+from agents.configuration.composition import DeviceKeys, ProgressKeys, Seed
+from scene_envs.errors import Natural
 
 
 @dataclass
@@ -23,8 +24,8 @@ class DemoConfig(DeviceKeys, ProgressKeys):
     """
 
     output: str = "runs/demo"
-    seed: int = 0
-    workers: int = 2
+    seed: Seed = 0
+    workers: Natural = 2
 
 
 def run(settings: DemoConfig, run: Run) -> None:
