@@ -20,7 +20,7 @@ from scipy.optimize import nnls
 from scipy.sparse import csr_array
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.collision import Collider, corner_tests, scene_pairs
+from scene_envs.physics.collision import Collider, boxes_near, corner_tests, scene_pairs
 from scene_envs.physics.parts import LibraryGeometry, Rows
 from scene_envs.physics.placement import (
     Budget,
@@ -247,7 +247,7 @@ def _near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
     """Object pairs of one scene whose boxes are within reach of each other: (P,), (P,)."""
     low, high = object_boxes(place(collider.library, objects, "coarse"))
     first, second = scene_pairs(objects)
-    near = ((low[first] <= high[second] + REACH) & (low[second] <= high[first] + REACH)).all(axis=1)
+    near = boxes_near(low, high, first, second, REACH)
     return first[near], second[near]
 
 
@@ -382,7 +382,7 @@ def _minimum_translations(
     """
     placed = place(collider.library, objects, "fine")
     pair, a, b = part_pairs(placed, first, second)
-    near = ((placed.low[a] <= placed.high[b] + _AROUND) & (placed.low[b] <= placed.high[a] + _AROUND)).all(axis=1)
+    near = boxes_near(placed.low, placed.high, a, b, _AROUND)
     pair, a, b = pair[near], a[near], b[near]
     budget.spent += len(pair)
     offset = objects.translation[second] - objects.translation[first]
