@@ -5,9 +5,12 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any, get_type_hints
+
+_MAX_NUMBER = 1e30
 
 
 class SceneEnvsError(Exception):
@@ -67,6 +70,11 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
     return UnknownNameError(f"unknown {kind} {name!r}{hint} Known: {', '.join(names) or '(none)'}.")
 
 
+def shown(value: Any) -> str:
+    """A value in a message, of bounded length; Python refuses to write integers of thousands of digits."""
+    return "a very large number" if isinstance(value, int) and abs(value) > _MAX_NUMBER else repr(value)[:200]
+
+
 @dataclass(frozen=True)
 class Limit:
     """Condition on the value of a field; ``rule`` ends the message of the InvalidInputError. None is accepted."""
@@ -76,9 +84,11 @@ class Limit:
 
     def check(self, place: str, name: str, value: Any, default: Any) -> None:
         """Raise unless it holds for the field ``name``, whose ``default`` says whether null is a choice."""
-        if value is not None and not self.holds(value):
-            null = ", or null" if default is None else ""
-            raise InvalidInputError(f"{place}{name}={value} {self.rule}{null}")
+        with suppress(TypeError):  # no number
+            if value is None or self.holds(value):
+                return
+        null = ", or null" if default is None else ""
+        raise InvalidInputError(f"{place}{name}={shown(value)} {self.rule}{null}")
 
 
 @dataclass(frozen=True)
@@ -101,7 +111,7 @@ def at_least(low: float) -> Limit:
 
 FINITE = Limit(math.isfinite, "must be a finite number")
 BELOW_ONE = Limit(lambda value: 0 <= value < 1, "must lie in [0, 1)")
-POSITIVE = Limit(lambda value: 0 < value < math.inf, "must be positive")
+POSITIVE = Limit(lambda value: 0 < value < math.inf, "must be a positive number")
 Positive = Annotated[float, POSITIVE]
 Count = Annotated[int, at_least(1)]
 Natural = Annotated[int, at_least(0)]

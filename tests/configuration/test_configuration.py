@@ -111,7 +111,7 @@ def test_limits_of_a_reward_are_one_mapping(command: str) -> None:
     assert limits("reward_limits={memory: 2}", "reward_limits.timeout=5") == {"timeout": 5.0, "memory": 2.0}
     with pytest.raises(UnknownNameError, match=r"reward_limits\.timeot.*did you mean 'reward_limits\.timeout'"):
         limits("reward_limits={timeot: 120}")
-    with pytest.raises(InvalidInputError, match=r"reward_limits\.memory=-1.0 must be positive"):
+    with pytest.raises(InvalidInputError, match=r"reward_limits\.memory=-1.0 must be a positive number"):
         limits("reward_limits.memory=-1")
 
 
