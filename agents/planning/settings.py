@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from agents.configuration.composition import (
     DeviceKeys,
@@ -15,7 +15,7 @@ from agents.configuration.composition import (
 )
 from agents.planning.gradient import GradientPlanner
 from agents.planning.ledger import PlannerSettings, list_planners, planner_settings
-from scene_envs.errors import Count, InvalidInputError, MaybeCount, Natural
+from scene_envs.errors import POSITIVE, Count, InvalidInputError, MaybeCount, Natural
 
 
 @dataclass
@@ -24,7 +24,7 @@ class BudgetKeys:
 
     budget: int = 64
     max_nfe: int | None = None
-    max_seconds: float | None = None
+    max_seconds: Annotated[float | None, POSITIVE] = None
     count: MaybeCount = None
     side_by_side: Count = 16
     baseline: bool = True
@@ -100,8 +100,6 @@ class SearchConfig(BudgetKeys, SamplingKeys, PrecisionKeys, DeviceKeys):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.max_seconds is not None and not self.max_seconds > 0:
-            raise InvalidInputError(f"max_seconds={self.max_seconds} must be more than 0, or null for no limit")
         if self.budget < self.branching:
             raise InvalidInputError(
                 f"budget={self.budget} scenes do not cover the {self.branching} first samples (branching); raise it"

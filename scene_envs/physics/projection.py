@@ -171,7 +171,9 @@ def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -
             break
         if budget.is_spent or corner_tests(collider.library, current, first, second).sum() > _OVERLAPPING:
             break
-        near_first, near_second = _near_pairs(collider, current)
+        near_first, near_second = pairs = scene_pairs(current)
+        near = boxes_near(*object_boxes(place(collider.library, current, "coarse")), *pairs, REACH)
+        near_first, near_second = near_first[near], near_second[near]
         extra = np.zeros((len(near_first), 3))
         if len(first):
             rows = np.searchsorted(near_first * len(home) + near_second, first * len(home) + second)
@@ -179,8 +181,10 @@ def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -
         planes = _separating_planes("coarse", collider, current, near_first, near_second, extra, home, budget)
         current = replace(current, translation=nearest(current, home, planes + walls, budget))
     assert best is not None
-    inside = _inside(best.translation, bounds)
-    return best if inside is best.translation else _measure(collider, replace(objects, translation=inside), budget)[2]
+    inside = np.clip(best.translation, *bounds)  # slack may have let some leave the workspace
+    if (np.abs(inside - best.translation) <= 0.9 * _INSIDE).all():
+        return best
+    return _measure(collider, replace(objects, translation=inside), budget)[2]
 
 
 def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:
@@ -199,12 +203,6 @@ def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, A
     low, high = np.array(workspace[0]), np.array(workspace[1])
     loose = objects.fixed | ((home < low - OUTSIDE) | (home > high + OUTSIDE)).any(axis=1)
     return np.where(loose[:, None], -np.inf, low + _INSIDE), np.where(loose[:, None], np.inf, high - _INSIDE)
-
-
-def _inside(translation: Array, bounds: tuple[Array, Array]) -> Array:
-    """The translations; if slack let some leave the workspace, they are put back."""
-    clipped = np.clip(translation, *bounds)
-    return clipped if (np.abs(clipped - translation) > 0.9 * _INSIDE).any() else translation
 
 
 def _walls(bounds: tuple[Array, Array]) -> Planes:
@@ -241,14 +239,6 @@ def heaps(collider: Collider, objects: Objects) -> Mask:
         if collider.pairs(looked_at).depth.max(initial=0.0) > _DEEP:
             chosen |= free & (group == number)
     return chosen
-
-
-def _near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
-    """Object pairs of one scene whose boxes are within reach of each other: (P,), (P,)."""
-    low, high = object_boxes(place(collider.library, objects, "coarse"))
-    first, second = scene_pairs(objects)
-    near = boxes_near(low, high, first, second, REACH)
-    return first[near], second[near]
 
 
 def _separating_planes(

@@ -217,7 +217,7 @@ def test_another_search_in_the_folder_is_refused(prior: ScenePrior, tmp_path: Pa
     [
         ({"budget": 0}, "budget=0 scenes do not cover the 3 first samples"),
         ({"max_nfe": 5}, "max_nfe=5 does not cover the 3 first samples .* raise it to 6"),
-        ({"max_seconds": 0}, "max_seconds=0 must be more than 0"),
+        ({"max_seconds": 0}, "max_seconds=0 must be a positive number"),
         ({"count": 0}, "count=0 must be at least 1"),
         ({"side_by_side": 0}, "side_by_side=0 must be at least 1"),
         ({"num_steps": 0}, "num_steps=0 must be"),
