@@ -24,7 +24,7 @@ from agents.cli import main
 from agents.planning import PlannerSettings, PlanResult, Searchable, SearchBudget, register_planner
 from agents.planning.ledger import Candidate, Progress, SteeredProblem
 from scene_envs import SceneBatch
-from scene_envs.errors import Count, InvalidInputError, MaybeCount, at_least
+from scene_envs.errors import Count, InvalidInputError, at_least
 
 
 @dataclass(eq=False)
@@ -97,8 +97,8 @@ class UCTPlanner(PlannerSettings):
     name: str = "uct"
     widens = True
     exploration: Annotated[float, at_least(0)] = 0.05
-    parallel: MaybeCount = None
-    children: MaybeCount = None
+    parallel: Count | None = None
+    children: Count | None = None
     widening: Annotated[float, at_least(0)] = 0.5
     max_loss: Annotated[float, at_least(0)] = 1.0
 
@@ -250,7 +250,7 @@ class TreeOverStepsPlanner(PlannerSettings):
     name: str = "tree_over_steps"
     widens = True
     steers = True
-    children: MaybeCount = None
+    children: Count | None = None
     stops: tuple[float, ...] = (0.5, 0.7)
     rounds: Count = 3
     exploration: Annotated[float, at_least(0)] = 0.05

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 _MAX_NUMBER = 1e30
 
@@ -111,16 +111,15 @@ def at_least(low: float) -> Limit:
 
 FINITE = Limit(math.isfinite, "must be a finite number")
 BELOW_ONE = Limit(lambda value: 0 <= value < 1, "must lie in [0, 1)")
-POSITIVE = Limit(lambda value: 0 < value < math.inf, "must be a positive number")
-Positive = Annotated[float, POSITIVE]
+Positive = Annotated[float, Limit(lambda value: 0 < value < math.inf, "must be a positive number")]
 Count = Annotated[int, at_least(1)]
 Natural = Annotated[int, at_least(0)]
-MaybeCount = Annotated[int | None, at_least(1)]
+Seed = Annotated[int, Limit(lambda seed: 0 <= seed < 2**63, "must be from 0 to 2^63 - 1")]
 Share = Annotated[float, Limit(lambda value: 0 <= value <= 1, "is outside 0..1: it is a share")]
 
 
 class Checked:
-    """Base of dataclasses whose fields have conditions in their annotations, which are checked when one is made.
+    """Base of dataclasses whose fields have conditions in their annotations, such as ``Count | None``, checked at the start.
 
     >>> @dataclass
     ... class Cup(Checked):
@@ -142,4 +141,5 @@ class Checked:
 @cache
 def _conditions(kind: type) -> list[tuple[str, Limit | OneOf]]:
     hints = get_type_hints(kind, include_extras=True)
-    return [(name, condition) for name, hint in hints.items() for condition in getattr(hint, "__metadata__", ())]
+    parts = [(name, part) for name, hint in hints.items() for part in (hint, *get_args(hint))]  # of a union, too
+    return [(name, condition) for name, part in parts for condition in getattr(part, "__metadata__", ())]

@@ -20,17 +20,7 @@ from types import NoneType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from agents.utils.loggers import LOGGERS
-from scene_envs.errors import (
-    Checked,
-    Count,
-    InvalidInputError,
-    Limit,
-    MaybeCount,
-    Natural,
-    OneOf,
-    Positive,
-    unknown_name,
-)
+from scene_envs.errors import Checked, Count, InvalidInputError, Natural, OneOf, Positive, Seed, unknown_name
 from scene_envs.registry import load_plugins, plugin_entry_points
 
 Config = TypeVar("Config")
@@ -45,7 +35,6 @@ _WANTED: dict[Any, str] = {
 }
 PROGRESS_STYLES = ("bar", "lines", "none")
 """How progress is shown, as in :data:`scene_envs.progress.STYLES`."""
-Seed = Annotated[int, Limit(lambda seed: 0 <= seed < 2**63, "must be from 0 to 2^63 - 1")]
 
 
 def check_types(kind: type, values: Mapping[str, Any]) -> None:
@@ -540,7 +529,7 @@ class SamplingKeys(PromptKeys):
     """
 
     num_steps: Count = 50
-    slots: MaybeCount = None
+    slots: Count | None = None
     seed: Seed = 0
 
 

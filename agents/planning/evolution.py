@@ -20,7 +20,7 @@ from agents.planning.ledger import (
     register_planner,
     state_value,
 )
-from scene_envs.errors import Count, MaybeCount, Natural, Share
+from scene_envs.errors import Count, Natural, Share
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -49,7 +49,7 @@ class EvolutionPlanner(PlannerSettings):
     name: str = "evolution"
     widens = True
     population: Count = 8
-    children: MaybeCount = None
+    children: Count | None = None
     crossover: Share = 0.5
     seed: Natural = 0
 

@@ -17,7 +17,7 @@ from agents.planning.ledger import (
     planner_settings,
     register_planner,
 )
-from scene_envs.errors import BELOW_ONE, InvalidInputError, MaybeCount, at_least, unknown_name
+from scene_envs.errors import BELOW_ONE, Count, InvalidInputError, at_least, unknown_name
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -53,7 +53,7 @@ class GradientPlanner(PlannerSettings):
     weight: Any = "overlap"
     strength: Annotated[float, at_least(0)] = 1.0
     begin: Annotated[float, BELOW_ONE] = 0.5
-    children: MaybeCount = None
+    children: Count | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

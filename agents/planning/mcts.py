@@ -16,7 +16,7 @@ from agents.planning.ledger import (
     register_planner,
     state_value,
 )
-from scene_envs.errors import MaybeCount, Natural, OneOf, at_least
+from scene_envs.errors import Count, Natural, OneOf, at_least
 
 
 @dataclass(eq=False)
@@ -50,7 +50,7 @@ class MCTSPlanner(PlannerSettings):
     name: str = "mcts"
     widens = True
     exploration: Annotated[float, at_least(0)] = 0.1
-    children: MaybeCount = None
+    children: Count | None = None
     rollout: Annotated[str, OneOf(("random", "all"))] = "all"
     seed: Natural = 0
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 from agents.configuration.composition import (
     DeviceKeys,
@@ -15,7 +15,7 @@ from agents.configuration.composition import (
 )
 from agents.planning.gradient import GradientPlanner
 from agents.planning.ledger import PlannerSettings, list_planners, planner_settings
-from scene_envs.errors import POSITIVE, Count, InvalidInputError, MaybeCount, Natural
+from scene_envs.errors import Count, InvalidInputError, Natural, Positive
 
 
 @dataclass
@@ -24,8 +24,8 @@ class BudgetKeys:
 
     budget: int = 64
     max_nfe: int | None = None
-    max_seconds: Annotated[float | None, POSITIVE] = None
-    count: MaybeCount = None
+    max_seconds: Positive | None = None
+    count: Count | None = None
     side_by_side: Count = 16
     baseline: bool = True
 

@@ -16,7 +16,7 @@ from agents.planning.ledger import (
     best_different,
     register_planner,
 )
-from scene_envs.errors import Count, MaybeCount
+from scene_envs.errors import Count
 
 
 @register_planner("best_of")
@@ -61,7 +61,7 @@ class BeamPlanner(PlannerSettings):
     name: str = "beam"
     widens = True
     width: Count = 3
-    children: MaybeCount = None
+    children: Count | None = None
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state."""
@@ -90,7 +90,7 @@ class GreedyPlanner(PlannerSettings):
 
     name: str = "greedy"
     widens = True
-    children: MaybeCount = None
+    children: Count | None = None
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state."""

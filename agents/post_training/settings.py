@@ -24,19 +24,7 @@ from agents.configuration.composition import (
 )
 from agents.utils.loggers import LOGGERS
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance, check_guidance
-from scene_envs.errors import (
-    BELOW_ONE,
-    POSITIVE,
-    Checked,
-    Count,
-    InvalidInputError,
-    Limit,
-    MaybeCount,
-    Natural,
-    OneOf,
-    Positive,
-    at_least,
-)
+from scene_envs.errors import BELOW_ONE, Checked, Count, InvalidInputError, Limit, Natural, OneOf, Positive, at_least
 from scene_envs.registry import Registry
 
 CREDITS = ("auto", "scene", "object")
@@ -289,7 +277,7 @@ class RegularisationSettings(Checked):
     place = "regularisation."
 
     objective: Annotated[str, OneOf(OBJECTIVES)] = "pretraining"
-    weight: Annotated[float | None, at_least(0)] = None
+    weight: Annotated[float, at_least(0)] | None = None
     base_samples: Count = 1024
     hold: str | None = None
     batch_size: Count = 48
@@ -320,8 +308,8 @@ class PostTrainOptimizerSettings(OptimizerSettings):
         chunk: scenes per forward and backward pass; null takes the whole batch at once.
     """
 
-    lr: Annotated[float | None, POSITIVE] = None  # type: ignore[assignment]
-    chunk: MaybeCount = None
+    lr: Positive | None = None  # type: ignore[assignment]
+    chunk: Count | None = None
 
 
 MIN_SAMPLES = 20
@@ -340,10 +328,10 @@ class GuardLimits(Checked):
         classifier: the same for the accuracy of a classifier that tells samples from real scenes.
     """
 
-    count: Annotated[float | None, at_least(0)] = None
-    stack: Annotated[float | None, at_least(0)] = None
-    category: Annotated[float | None, at_least(0)] = None
-    classifier: Annotated[float | None, at_least(0)] = None
+    count: Annotated[float, at_least(0)] | None = None
+    stack: Annotated[float, at_least(0)] | None = None
+    category: Annotated[float, at_least(0)] | None = None
+    classifier: Annotated[float, at_least(0)] | None = None
 
 
 @dataclass

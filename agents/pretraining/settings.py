@@ -12,7 +12,6 @@ from agents.configuration.composition import (
     LoggerSettings,
     OptimizerSettings,
     ProgressKeys,
-    Seed,
     TrainingKeys,
     composed,
     named,
@@ -25,10 +24,10 @@ from scene_envs.errors import (
     Checked,
     Count,
     InvalidInputError,
-    MaybeCount,
     Natural,
     OneOf,
     Positive,
+    Seed,
     Share,
     at_least,
 )
@@ -74,8 +73,8 @@ class FluxSettings(Checked):
     """
 
     frequencies: Natural = 8
-    double_blocks: MaybeCount = None
-    embedding: MaybeCount = None
+    double_blocks: Count | None = None
+    embedding: Count | None = None
     pose_head: Count = 64
     time_scale: Positive = 1.0
     text_reach: Annotated[str, OneOf(("double", "all"), "reach of text")] = "double"

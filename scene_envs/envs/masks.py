@@ -72,7 +72,7 @@ _SOME = Limit(lambda number: type(number) is int and number >= 0, "must be a who
 class EmptyMask(Checked):
     """Empty slots, and no object: ``count`` of them at random, or all with None."""
 
-    count: Annotated[int | None, _SOME] = None
+    count: Annotated[int, _SOME] | None = None
 
     place = "mask=empty: "
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
-from scene_envs.errors import POSITIVE, Checked, InvalidInputError, Limit, OneOf, Positive, shown
+from scene_envs.errors import Checked, InvalidInputError, Limit, OneOf, Positive, shown
 from scene_envs.scene_types import SceneType
 
 ACTION_MODES = ("next_sample", "noise")
@@ -39,7 +39,7 @@ class EnvSettings(Checked):
     scene: str | SceneType | None = None
     prior: Any = None
     num_steps: Annotated[int, _WHOLE] = 50
-    slots: Annotated[int | None, _SLOTS] = None
+    slots: Annotated[int, _SLOTS] | None = None
     workers: int | str = 0
     physics: str = "auto"
     device: str = "auto"
@@ -83,8 +83,8 @@ class TreeSettings(EnvSettings):
     objective: Any = "feasible_objects"
     branching: Annotated[int, _WHOLE] = 4
     max_depth: Annotated[int, _WHOLE] = 10
-    objective_scale: Annotated[float | None, POSITIVE] = None
-    max_nfe: Annotated[int | None, _WHOLE] = None
+    objective_scale: Positive | None = None
+    max_nfe: Annotated[int, _WHOLE] | None = None
     claim_guidance: float = 0.0
     physics_guidance: float = 0.0
 

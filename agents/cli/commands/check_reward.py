@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from agents.configuration.composition import RewardLimitKeys, Seed, named
+from agents.configuration.composition import RewardLimitKeys, named
+from scene_envs.errors import Seed
 
 WRITES = False
 

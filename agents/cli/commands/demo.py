@@ -9,8 +9,8 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 
 from agents.cli.run_folder import Run
-from agents.configuration.composition import DeviceKeys, ProgressKeys, Seed
-from scene_envs.errors import Natural
+from agents.configuration.composition import DeviceKeys, ProgressKeys
+from scene_envs.errors import Natural, Seed
 
 
 @dataclass

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from agents.cli.commands.scenes import draw, load_prior, make_ready
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
-from scene_envs.errors import InvalidInputError, MaybeCount, Natural, at_least
+from scene_envs.errors import Count, InvalidInputError, Natural, at_least
 
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
@@ -42,7 +42,7 @@ class ExportConfig(DrawKeys):
     scenes: str = ""
     prior: str = ""
     formats: Any = "all"
-    count: MaybeCount = None
+    count: Count | None = None
     project: bool = False
     friction: Annotated[float, at_least(0)] = 0.6
     workers: Natural = 2

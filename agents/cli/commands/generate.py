@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 from agents.cli.run_folder import Run
-from agents.configuration.composition import ProgressKeys, Seed, named
-from scene_envs.errors import Count, Natural, OneOf
+from agents.configuration.composition import ProgressKeys, named
+from scene_envs.errors import Count, Natural, OneOf, Seed
 
 
 @dataclass

@@ -7,9 +7,9 @@ from typing import Any
 
 from agents.cli.commands.scenes import check_files
 from agents.cli.run_folder import Run
-from agents.configuration.composition import DeviceKeys, Seed, named
+from agents.configuration.composition import DeviceKeys, named
 from scene_envs.arrays import resolve_device
-from scene_envs.errors import Count, InvalidInputError, Natural
+from scene_envs.errors import Count, InvalidInputError, Natural, Seed
 
 POSITIONAL = ("checkpoint", "metadata")
 """Words without ``=`` fill these keys, in this order."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys, PromptKeys
-from scene_envs.errors import InvalidInputError, MaybeCount, Natural, at_least
+from scene_envs.errors import Count, InvalidInputError, Natural, at_least
 
 if TYPE_CHECKING:
     from agents.priors.prior import ScenePrior
@@ -39,7 +39,7 @@ class InpaintingConfig(PromptKeys, DrawKeys):
 
     scenes: str = ""
     prior: str = ""
-    count: MaybeCount = None
+    count: Count | None = None
     pictures: Natural = 12
     output: str = ""
 
@@ -97,8 +97,8 @@ class CompleteConfig(InpaintingConfig):
         fill: most objects to add to a scene; null for as many as there are empty slots.
     """
 
-    slots: MaybeCount = None
-    fill: Annotated[int | None, at_least(0)] = None
+    slots: Count | None = None
+    fill: Annotated[int, at_least(0)] | None = None
 
 
 def run_complete(settings: CompleteConfig, run: Run) -> None:

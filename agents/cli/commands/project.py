@@ -7,7 +7,7 @@ from pathlib import Path
 
 from agents.cli.commands.scenes import draw_scenes, make_ready
 from agents.cli.run_folder import Run
-from scene_envs.errors import Checked, InvalidInputError, MaybeCount, Natural
+from scene_envs.errors import Checked, Count, InvalidInputError, Natural
 
 
 @dataclass
@@ -24,7 +24,7 @@ class ProjectConfig(Checked):
     """
 
     scenes: str = ""
-    count: MaybeCount = None
+    count: Count | None = None
     pictures: Natural = 12
     workers: Natural = 2
     physics: str = "auto"
