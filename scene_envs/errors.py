@@ -119,7 +119,7 @@ Share = Annotated[float, Limit(lambda value: 0 <= value <= 1, "is outside 0..1: 
 
 
 class Checked:
-    """Base of dataclasses whose fields have conditions in their annotations, such as ``Count | None``, checked at the start.
+    """Base of dataclasses with conditions in the annotations of their fields, as ``Count | None``, checked when made.
 
     >>> @dataclass
     ... class Cup(Checked):
