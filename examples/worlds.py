@@ -3,8 +3,8 @@
     scene-envs sample prior=dimsum_table count=64 project=true export=worlds output=runs/tables
     python examples/worlds.py runs/tables/export/worlds.npz
 
-steps all worlds at once with MuJoCo Warp (``pip install mujoco-warp``), each with its own scene: on a GPU where there is
-one (4,096 worlds: nworld=4096), else on the CPU. Kernels are compiled on the first run, for about a minute. The file
+steps all worlds at once with MuJoCo Warp (``pip install mujoco-warp``), each with its own scene: on a GPU where there
+is one (4,096 worlds: nworld=4096), else on the CPU. Kernels are compiled on the first run, for about a minute. The file
 needs no part of SceneEnvs: copy the loaders where you need them.
 """
 

@@ -48,9 +48,9 @@ def export(
 ) -> ExportReport:
     """Write scenes for simulators and viewers.
 
-    ``output`` gets ``assets/<asset>/`` (meshes, convex parts, URDF; written once and shared) and
-    ``scene_000/``, ``scene_001/``, … with one main file per format. All paths inside are relative, so the
-    folder can be moved. The format ``worlds`` has one file for all scenes. Poses are written in full double precision. More formats can be added to the same
+    ``output`` gets ``assets/<asset>/`` (meshes, convex parts, URDF; written once and shared) and ``scene_000/``,
+    ``scene_001/``, … with one main file per format; ``worlds`` has one for all scenes. All paths inside are relative,
+    so the folder can be moved. Poses are written in full double precision. More formats can be added to the same
     scenes by a second call; an interrupted export goes on when the same call is made again.
 
     Args:

@@ -107,7 +107,8 @@ def list_formats() -> list[str]:
 
 def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     """Names of formats, each once, from one name, several, or ``"all"`` (those with a file per scene that can be
-    written here). Raises UnknownNameError, MissingDependencyError for a format without its package, and InvalidInputError for none.
+    written here). Raises UnknownNameError, MissingDependencyError for a format without its package, and
+    InvalidInputError for none.
 
     >>> resolve_formats(["mjcf", "npz", "mjcf"])
     ('mjcf', 'npz')

@@ -18,7 +18,9 @@ from scene_envs.scene_types import Camera
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene.xml``: one body per object, with a free joint of the same name unless it is welded."""
-    root, world = new_model(f"{scene.scene_type.name}_{scene.index}", scene.scene_type.camera, scene.assets, files, folder)
+    root, world = new_model(
+        f"{scene.scene_type.name}_{scene.index}", scene.scene_type.camera, scene.assets, files, folder
+    )
     for item in scene.objects:
         _add_body(world, item, files)
     return write_xml(root, folder / "scene.xml")

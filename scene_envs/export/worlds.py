@@ -15,17 +15,18 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from scene_envs.arrays import Array, Index
+from scene_envs.arrays import Array
 from scene_envs.assets.base import Asset
 from scene_envs.errors import InvalidInputError
 from scene_envs.export.mjcf import new_model
-from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene
+from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, quaternion
 from scene_envs.export.urdf import write_xml
 from scene_envs.files import replacing
-from scene_envs.physics.parts import apply, principal_inertia, quaternions
+from scene_envs.physics.parts import principal_inertia
 
 _NONE = 1e-9
-"""Mass (kg), moments of inertia (kg m^2) and size (m) where there is no object; a size of 0 would be that of a plane."""
+"""Mass (kg), moments of inertia (kg m^2) and size (m) where there is no object; a size of 0 is that of a plane."""
+_UNTURNED = (1.0, 0.0, 0.0, 0.0)
 _MOST = 1 << 28
 """Geometries of all worlds together above which the arrays do not fit into the memory of a GPU."""
 
@@ -48,9 +49,9 @@ def write_worlds(scenes: Sequence[PlacedScene], files: AssetFiles, folder: Path)
     """``worlds.xml``, the model, and ``worlds.npz``, which ``numpy.load`` alone can read; returns the second.
 
     Of W scenes, the model has B bodies, world included, G geometries, F bodies for welded objects and S for free ones.
-    Welded objects are mocap bodies ``welded_0`` …; free ones are ``object_0`` … with a free joint of that name. The frame
-    of a body is that of its asset. In each scene, objects are sorted by their number of convex parts, then by category
-    and slot. A body without an object has no geometry and no weight, and stays at the origin.
+    Welded objects are mocap bodies ``welded_0`` …; free ones are ``object_0`` … with a free joint of that name. The
+    frame of a body is that of its asset. In each scene, objects are sorted by their number of convex parts, then by
+    category and slot. A body without an object has no geometry and no weight, and stays at the origin.
 
     Arrays ``world/FIELD`` (W, ...) are fields of MuJoCo's model, a row for each world: ``geom_dataid`` (W, G), mesh of
     each geometry, -1 for none; ``geom_friction`` (W, G, 3); ``body_pos`` (W, B, 3) m and ``body_quat`` (W, B, 4), where
@@ -66,7 +67,9 @@ def write_worlds(scenes: Sequence[PlacedScene], files: AssetFiles, folder: Path)
     """
     columns = [*_columns(scenes, welded=True), *_columns(scenes, welded=False)]
     if not columns:
-        raise InvalidInputError(f"worlds of {len(scenes)} scenes without objects: give at least one scene with an object")
+        raise InvalidInputError(
+            f"worlds of {len(scenes)} scenes without objects: give at least one scene with an object"
+        )
     count = len(scenes) * sum(1 + column.parts for column in columns)
     if count > _MOST:
         raise InvalidInputError(f"{len(scenes)} worlds have {count} geometries, more than {_MOST}: export fewer scenes")
@@ -124,7 +127,7 @@ def _meshes(path: Path) -> tuple[dict[str, int], dict[str, Array]]:
         geometry = probe.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
         geometry.material = "" if material == name else material
     model = spec.compile()
-    last = [("pos", 0.0), ("quat", (1.0, 0, 0, 0)), ("size", _NONE), ("rbound", _NONE), ("matid", -1)]
+    last: list[tuple[str, Any]] = [("pos", 0.0), ("quat", _UNTURNED), ("size", _NONE), ("rbound", _NONE), ("matid", -1)]
     rows = {name: (getattr(model, f"geom_{name}")[-len(names) :], empty) for name, empty in last}
     rows["aabb"] = model.geom_aabb[-len(names) :], (0.0, 0, 0, _NONE, _NONE, _NONE)
     numbers = {name: int(model.mesh(name).id) for name in names}
@@ -137,73 +140,64 @@ def _meshes(path: Path) -> tuple[dict[str, int], dict[str, Array]]:
 
 def _arrays(columns: Sequence[_Column], meshes: tuple[dict[str, int], dict[str, Array]], files: AssetFiles) -> Any:
     """All arrays of the worlds."""
-    numbers, arrays = meshes
-    found = [
+    number, arrays = meshes
+    worlds, bodies, fixed = len(columns[0].objects), 1 + len(columns), sum(column.welded for column in columns)
+    first = np.cumsum([0, *(1 + column.parts for column in columns)])
+    placed = [
         (world, body, item)
         for body, column in enumerate(columns, start=1)
         for world, item in enumerate(column.objects)
         if item is not None
     ]
-    world, body = (np.array([row[index] for row in found], dtype=np.int64) for index in (0, 1))
-    items = [row[2] for row in found]
-    worlds, bodies, fixed = len(columns[0].objects), 1 + len(columns), sum(column.welded for column in columns)
-    first = np.cumsum([0, *(1 + column.parts for column in columns)])
-    shapes = {
-        asset: [numbers[f"{files.name(asset)}_visual"]]
-        + [numbers[f"{files.name(asset)}_{part.stem}"] for part in files.parts(asset)]
-        for asset in {item.asset for item in items}
-    }
+    free = [row for row in placed if not row[2].welded]
 
-    def bodywise(values: Any, empty: Any) -> Any:
-        """(W, B, ...) of the values of the objects; ``empty`` where there is none."""
+    def table(rows: Sequence[tuple[int, int, PlacedObject]], values: Any, empty: Any) -> Any:
+        """(W, B, ...) of the values of the objects ``rows``; the others are ``empty``."""
         values = np.asarray(values)
         out = np.empty((worlds, bodies, *values.shape[1:]), dtype=values.dtype)
         out[:] = empty
-        out[world, body] = values
+        out[[world for world, _, _ in rows], [body for _, body, _ in rows]] = values
         return out
 
-    dataid: Index = np.full((worlds, first[-1]), -1, dtype=np.int32)
-    for row, column, item in found:
-        start, mesh = first[column - 1], shapes[item.asset]
-        dataid[row, start : start + len(mesh)] = mesh
-    friction = np.broadcast_to((files.friction, 0.005, 0.0001), (worlds, first[-1], 3)).copy()
-    pose = bodywise([np.concatenate([item.translation, item.quaternion]) for item in items], (0, 0, 0, 1.0, 0, 0, 0))
-    free = np.array([not item.welded for item in items])
-    moments, axes = principal_inertia(np.stack([item.asset.inertia if not item.welded else np.eye(3) for item in items]))
-    mass = np.array([1.0 if item.welded else item.asset.mass for item in items])
-    center = np.array([(0.0, 0.0, 0.0) if item.welded else item.asset.center_of_mass for item in items])
-    turn = np.roll(quaternions(axes), 1, axis=1)
-    turn[turn[:, 0] < 0] *= -1.0
-    inverse = np.stack([1.0 / mass, (1.0 / moments).mean(axis=1)], axis=1)
-    # at the frame of the body, a push also turns it: by the trace of [c]^T I^-1 [c] over three
-    arm = np.cross(center[:, None], np.swapaxes(axes, 1, 2))
-    pushed = inverse[:, 0] + ((arm**2).sum(axis=2) / moments).sum(axis=1) / 3.0
-    mass_of, weight = bodywise(np.where(free, mass, 0.0), 0.0), bodywise(inverse * free[:, None], 0.0)
-    dofs = bodywise(np.repeat(np.stack([pushed, inverse[:, 1]], axis=1), 3, axis=1), 1.0 / _NONE)
-    none = np.ones((worlds, bodies), dtype=bool)
-    none[world, body] = False
-    none[:, : 1 + fixed] = False
-    mass_of[none] = _NONE
-    weight[none] = 1.0 / _NONE
-    subtree = mass_of.copy()
-    subtree[:, 0] = mass_of.sum(axis=1)
+    shapes: dict[Asset, list[int]] = {}
+    dataid = np.full((worlds, first[-1]), -1, dtype=np.int32)
+    for world, body, item in placed:
+        if (asset := item.asset) not in shapes:
+            names = ["visual", *(part.stem for part in files.parts(asset))]
+            shapes[asset] = [number[f"{files.name(asset)}_{name}"] for name in names]
+        dataid[world, first[body - 1] : first[body - 1] + len(shapes[asset])] = shapes[asset]
+    position = table(placed, [item.translation for _, _, item in placed], 0.0)
+    turn = table(placed, quaternion(np.stack([item.rotation for _, _, item in placed])), _UNTURNED)
+    friction = table(placed, [files.friction for _ in placed], files.friction)[:, 1:].repeat(np.diff(first), axis=1)
+    mass = np.array([item.asset.mass for _, _, item in free])
+    center = np.array([item.asset.center_of_mass for _, _, item in free]).reshape(-1, 3)
+    moments, axes = principal_inertia(np.array([item.asset.inertia for _, _, item in free]).reshape(-1, 3, 3))
+    weight = np.stack([1.0 / mass, (1.0 / moments).mean(axis=1)], axis=1)
+    # a push at the origin of the body turns it as well: the mean over directions is tr([c]^T I^-1 [c]) / 3
+    arm = np.cross(center[:, None], axes.swapaxes(1, 2))
+    push = weight[:, 0] + ((arm * arm).sum(axis=2) / moments).sum(axis=1) / 3.0
+    none = np.where(np.arange(bodies) > fixed, _NONE, 0.0)
+    rare = np.where(np.arange(bodies) > fixed, 1.0 / _NONE, 0.0)[:, None]
     fields = {
         "geom_dataid": dataid,
-        "geom_friction": friction,
-        "body_pos": pose[..., :3],
-        "body_quat": pose[..., 3:],
-        "body_mass": mass_of,
-        "body_subtreemass": subtree,
-        "body_inertia": np.where(none[..., None], _NONE, bodywise(moments * free[:, None], 0.0)),
-        "body_ipos": bodywise(center, 0.0),
-        "body_iquat": bodywise(turn, (1.0, 0, 0, 0)),
-        "body_invweight0": weight,
-        "body_gravcomp": none.astype(np.float64),
-        "dof_invweight0": dofs[:, 1 + fixed :].reshape(worlds, -1),
-        "qpos0": pose[:, 1 + fixed :].reshape(worlds, -1),
+        "geom_friction": np.stack([friction, *(np.full_like(friction, value) for value in (0.005, 0.0001))], axis=2),
+        "body_pos": position,
+        "body_quat": turn,
+        "body_mass": table(free, mass, none),
+        "body_inertia": table(free, moments, none[:, None]),
+        "body_ipos": table(free, center, 0.0),
+        "body_iquat": table(free, quaternion(axes), _UNTURNED),
+        "body_invweight0": table(free, weight, rare),
+        "body_gravcomp": table(placed, np.zeros(len(placed)), none > 0),
+        "dof_invweight0": table(free, np.repeat(np.stack([push, weight[:, 1]], 1), 3, 1), rare)[:, 1 + fixed :],
+        "qpos0": np.concatenate([position, turn], axis=2)[:, 1 + fixed :],
     }
+    subtree = fields["body_subtreemass"] = fields["body_mass"].copy()
+    subtree[:, 0] = subtree.sum(axis=1)
+    for name in ("dof_invweight0", "qpos0"):
+        fields[name] = fields[name].reshape(worlds, -1)
     arrays |= {f"world/{name}": values for name, values in fields.items()}
-    arrays["names"] = bodywise([item.name for item in items], "")[:, 1:]
-    arrays["categories"] = bodywise([item.category for item in items], -1)[:, 1:]
-    arrays["slots"] = bodywise([item.slot for item in items], -1)[:, 1:]
+    arrays["names"] = table(placed, [item.name for _, _, item in placed], "")[:, 1:]
+    arrays["categories"] = table(placed, [item.category for _, _, item in placed], -1)[:, 1:]
+    arrays["slots"] = table(placed, [item.slot for _, _, item in placed], -1)[:, 1:]
     return arrays
