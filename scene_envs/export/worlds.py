@@ -107,7 +107,7 @@ def _model(
             # another frame than the body's: MuJoCo must not compile in that both are the same
             inertial = {"pos": "0.1 0.2 0.3", "quat": "0.5 0.1 0.3 0.7"}
             ET.SubElement(body, "inertial", {**inertial, "mass": "1", "diaginertia": "1 1 1"})
-        ET.SubElement(body, "geom", {"class": "visual", "mesh": mesh})
+        ET.SubElement(body, "geom", {"class": "visual", "mesh": mesh, "material": files.name(assets[0])})
         for _ in range(column.parts):
             ET.SubElement(body, "geom", {"class": "collision", "mesh": part})
     return root
