@@ -34,11 +34,12 @@ def world_fields(path: str | Path, model: Any, scenes: Sequence[int], prefix: st
         fields |= {key[5:]: file[key][fields["geom_dataid"]] for key in file if key.startswith("mesh/")}
     names = [model.body(index).name.removeprefix(prefix) for index in range(model.nbody)]
     bodies = [index for index, name in enumerate(names) if name.startswith(("welded_", "object_"))]
-    geometry, joints = model.body_geomadr[bodies[0]], model.body_jntadr[bodies]
+    geometry, free = model.body_geomadr[bodies[0]], [index for index in bodies if model.body_jntnum[index]]
     for name in ("geom_dataid", "geom_matid"):  # the first geometry of worlds.xml has mesh 0 and material 0
         fields[name] += np.where(fields[name] < 0, 0, getattr(model, name)[geometry]).astype(fields[name].dtype)
-    joint = joints[joints >= 0][0]
-    first = {"body": bodies[0], "geom": geometry, "dof": model.jnt_dofadr[joint], "qpos0": model.jnt_qposadr[joint]}
+    joints = model.body_jntadr[free[:1]]
+    first = {"body": bodies[0], "geom": geometry}
+    first |= {"dof": model.jnt_dofadr[joints].sum(), "qpos0": model.jnt_qposadr[joints].sum()}
     for name, rows in fields.items():
         kind = name.split("_")[0]
         rows = rows[:, 1:] if kind == "body" else rows  # not that of the world
@@ -58,7 +59,7 @@ def mujoco_world(path: str | Path, scene: int) -> tuple[Any, Any]:
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE  # the trees of boxes are of the compiled meshes
     data = mujoco.MjData(model)
     mujoco.mj_setConst(model, data)  # the mass matrix at the start
-    model.stat.meaninertia = model.dof_M0.mean()  # the scale of the solver's tolerance
+    model.stat.meaninertia = model.dof_M0.sum() / max(1, model.nv)  # the scale of the solver's tolerance
     mujoco.mj_resetData(model, data)
     return model, data
 
