@@ -134,6 +134,7 @@ def newton_worlds(path: str | Path, scenes: Sequence[int], contacts: int = 400) 
                     cfg=newton.ModelBuilder.ShapeConfig(density=0.0, gap=0.0, mu=f["geom_friction"][geom, 0]),
                     custom_attributes={
                         "mujoco:solref": model.geom_solref[geom].tolist(),
+                        "mujoco:solref_mode": 1,  # solref as it is, not from the stiffness of the shape
                         "mujoco:geom_solimp": model.geom_solimp[geom].tolist(),
                     },
                 )
