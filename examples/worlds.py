@@ -25,13 +25,17 @@ def compiled(path: str | Path) -> Any:
     return mujoco.MjModel.from_xml_path(str(Path(path).with_suffix(".xml")))
 
 
-def world_fields(path: str | Path, model: Any, scenes: Sequence[int], prefix: str = "") -> dict[str, Any]:
+def world_fields(
+    path: str | Path, model: Any, scenes: Sequence[int], prefix: str = "", at: Sequence[float] = (0.0, 0.0, 0.0)
+) -> dict[str, Any]:
     """Fields (W, ...) of ``model`` in which world w holds scene ``scenes[w]``. The model is worlds.xml, or one with
-    other bodies to which it is attached under a ``prefix``.
+    other bodies, such as a robot, to which it is attached under a ``prefix``; then the scenes' origin is ``at`` (m).
     """
     with np.load(path) as file:
         fields = {key[6:]: file[key][scenes] for key in file if key.startswith("world/")}
         fields |= {key[5:]: file[key][fields["geom_dataid"]] for key in file if key.startswith("mesh/")}
+    fields["body_pos"] += at
+    fields["qpos0"].reshape(len(scenes), -1, 7)[..., :3] += at
     names = [model.body(index).name.removeprefix(prefix) for index in range(model.nbody)]
     bodies = [index for index, name in enumerate(names) if name.startswith(("welded_", "object_"))]
     geometry, free = model.body_geomadr[bodies[0]], [index for index in bodies if model.body_jntnum[index]]
@@ -69,9 +73,13 @@ def fill(m: Any, fields: dict[str, Any]) -> None:
     import warp
 
     for name, rows in fields.items():
-        dtype = getattr(m, name).dtype
+        field = getattr(m, name)
         shape = rows.shape if name != "geom_aabb" else (*rows.shape[:-1], 2, 3)
-        setattr(m, name, warp.array(np.ascontiguousarray(rows).reshape(shape), dtype=dtype))
+        filled = warp.array(rows.reshape(shape), dtype=field.dtype)
+        if field.shape == filled.shape:
+            field.assign(filled)  # a captured graph goes on reading it
+        else:
+            setattr(m, name, filled)
 
 
 def warp_worlds(path: str | Path, nworld: int, contacts: int = 400) -> tuple[Any, Any]:
