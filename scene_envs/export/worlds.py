@@ -26,6 +26,8 @@ from scene_envs.physics.parts import principal_inertia
 
 _NONE = 1e-9
 """Mass (kg), moments of inertia (kg m^2) and size (m) where there is no object; a size of 0 is that of a plane."""
+_APART = 50
+"""Distance of the bodies, m, in the model without the arrays."""
 _UNTURNED = (1.0, 0.0, 0.0, 0.0)
 _MOST = 1 << 28
 """Geometries of all worlds together above which the arrays do not fit into the memory of a GPU."""
@@ -100,8 +102,9 @@ def _model(
     root, world = new_model(f"{scene.scene_type.name}_worlds", scene.scene_type.camera, assets, files, folder)
     first = files.name(assets[0])
     parts = cycle(f"{files.name(asset)}_{part.stem}" for asset in assets for part in files.parts(asset))
-    for column in columns:
-        body = ET.SubElement(world, "body", {"name": column.name, "gravcomp": "1"})
+    for index, column in enumerate(columns):  # far from each other: as compiled, no two bodies touch
+        place = f"{_APART * index} 0 {_APART}"
+        body = ET.SubElement(world, "body", {"name": column.name, "pos": place, "gravcomp": "1"})
         if column.welded:
             body.set("mocap", "true")
         else:
