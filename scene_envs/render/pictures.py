@@ -1,17 +1,18 @@
-"""Renderer of scenes: lit pictures and semantic images."""
+"""Lit pictures of scenes, and pages of several."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.arrays import Array, Index
+from scene_envs.errors import InvalidInputError
+from scene_envs.render.raster import Pinhole
 from scene_envs.render.stage import (
-    Frame,
     Stage,
     contact_shade,
     frame_scene_type,
@@ -20,7 +21,7 @@ from scene_envs.render.stage import (
     picture_camera,
     scene_type_of_one,
     soft_shadow,
-    surface_normals,
+    to_pinhole,
 )
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, SceneType
@@ -29,15 +30,11 @@ if TYPE_CHECKING:
     from PIL import Image
 
 
-Style = Literal["picture", "semantic"]
-
 _BACKDROP = np.array([[250.0, 249.0, 247.0], [226.0, 230.0, 235.0]], dtype=np.float32)
 _HIGHLIGHT = np.array([226.0, 52.0, 40.0], dtype=np.float32)
 _SHADOW = np.array([0.40, 0.38, 0.34], dtype=np.float32)
 """Share of red, green and blue that a full shadow takes away."""
-_SEMANTIC_BACKGROUND = 255
 _SUPERSAMPLING = 2
-_STYLES = ("picture", "semantic")
 _TABLE = 0.68
 """Radius (m) of the framing of a dim sum table, for which contact shading is tuned."""
 _PAGE, _INK = (255, 255, 255), (58, 62, 70)
@@ -46,54 +43,52 @@ _PAGE, _INK = (255, 255, 255), (58, 62, 70)
 def render(
     batch: SceneBatch,
     *,
-    style: Style = "picture",
-    camera: Camera | None = None,
+    camera: Camera | Pinhole | None = None,
     width: int | None = None,
     height: int | None = None,
     highlight: torch.Tensor | NDArray[np.bool_] | None = None,
 ) -> NDArray[np.uint8]:
-    """Draw scenes in software; no display, GPU or simulator is needed.
+    """Lit pictures of scenes with soft shadows, drawn in software; no display, GPU or simulator is needed.
+
+    :func:`~scene_envs.render.sensors.observe` gives depth, masks and other images of the same scenes.
 
     Args:
         batch: B scenes.
-        style: ``"picture"`` is a lit three-quarter view with soft shadows. In types without fixed objects, a scene with
-            just one support is framed by this support. ``"semantic"`` is one flat colour per asset on white, seen by
-            the camera of the scene type (the paper's: 640 x 480, 45 degrees).
-        camera: Camera in place of that of the style.
+        camera: Camera in place of the three-quarter view of the scene type. Without it, a scene with just one support,
+            in a type without fixed objects, is framed by this support.
         width: Image width, pixels; the camera's by default. The view of a picture is fitted to the image.
         height: Image height, pixels; the camera's by default.
-        highlight: (B, N) bool, objects to draw in red (pictures only).
+        highlight: (B, N) bool, objects to draw in red.
 
     Returns:
         (B, H, W, 3) uint8, RGB.
 
     Raises:
-        UnknownNameError: no such style.
-        InvalidInputError: sizes below 1 pixel, or a highlight of another shape.
+        InvalidInputError: sizes below 1 pixel, a camera without a direction, or a highlight of another shape.
     """
     scene_type = batch.scene_type
-    if style not in _STYLES:
-        raise unknown_name("render style", style, _STYLES)
     size = {name: value for name, value in (("width", width), ("height", height)) if value is not None}
-    default = camera or (scene_type.camera if style == "semantic" else picture_camera(scene_type, **size))
-    width, height = default.width if width is None else width, default.height if height is None else height
-    if width < 1 or height < 1:
-        raise InvalidInputError(f"an image needs at least 1 x 1 pixels, got width={width}, height={height}")
+    view = to_pinhole(camera or picture_camera(scene_type, **size), width, height)
     marked = _as_mask(highlight, batch)
-    translations = batch.translations.detach().cpu().double().numpy()
-    categories = batch.categories.detach().cpu().numpy()
-    rotations = batch.rotations.detach().cpu().double().numpy()
-    stage = get_stage(scene_type.assets, scene_type.asset_folders)
-    images = np.empty((len(batch), height, width, 3), dtype=np.uint8)
-    for index, rotation in enumerate(rotations):
-        stage.place(translations[index], rotation, categories[index])
-        if style == "semantic":
-            images[index] = _semantic(stage.look(default, width, height), categories[index], scene_type)
-        else:
-            seen = scene_type_of_one(scene_type, translations[index], rotation, categories[index])
-            view = camera or (default if seen is scene_type else picture_camera(seen, width, height))
-            images[index] = _picture(stage, view, width, height, seen, marked[index])
+    images = np.empty((len(batch), view.height, view.width, 3), dtype=np.uint8)
+    for index, (stage, poses) in enumerate(stages(batch)):
+        seen = scene_type if camera else scene_type_of_one(scene_type, *poses)
+        own = view if seen is scene_type else to_pinhole(picture_camera(seen, view.width, view.height))
+        images[index] = draw_picture(stage, own, seen, marked[index])
     return images
+
+
+def stages(batch: SceneBatch) -> Iterator[tuple[Stage, tuple[Array, Array, Index]]]:
+    """For each scene, the stage with its objects, which is the same one, and their translations (N, 3) m, rotations
+    (N, 3, 3) and categories (N,).
+    """
+    translations = batch.translations.detach().cpu().double().numpy()
+    rotations = batch.rotations.detach().cpu().double().numpy()
+    categories = batch.categories.detach().cpu().numpy()
+    stage = get_stage(batch.scene_type.assets, batch.scene_type.asset_folders)
+    for poses in zip(translations, rotations, categories, strict=True):
+        stage.place(*poses)
+        yield stage, poses
 
 
 def _as_mask(highlight: torch.Tensor | NDArray[np.bool_] | None, batch: SceneBatch) -> NDArray[np.bool_]:
@@ -106,46 +101,64 @@ def _as_mask(highlight: torch.Tensor | NDArray[np.bool_] | None, batch: SceneBat
     return mask.astype(bool)
 
 
-def _semantic(frame: Frame, categories: NDArray[np.int64], scene_type: SceneType) -> NDArray[np.uint8]:
-    colors = np.array([asset.color for asset in scene_type.library], dtype=np.uint8)
-    flat = np.full((*frame.slots.shape, 3), _SEMANTIC_BACKGROUND, dtype=np.uint8)
-    seen = frame.slots >= 0
-    flat[seen] = colors[categories[frame.slots[seen]]]
-    return flat
-
-
-def _picture(
-    stage: Stage, camera: Camera, width: int, height: int, scene_type: SceneType, marked: NDArray[np.bool_]
-) -> NDArray[np.uint8]:
+def draw_picture(stage: Stage, camera: Pinhole, scene_type: SceneType, marked: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8: what ``camera`` sees of the objects on the stage, lit as scenes of the type are, with the slots
+    ``marked`` (N,) in red. A pixel is the mean of 2 x 2 samples, which are shaded once where they show one triangle.
+    """
     from scipy.ndimage import uniform_filter
 
-    scale = _SUPERSAMPLING
+    height, width, scale = camera.height, camera.width, _SUPERSAMPLING
     framing = frame_scene_type(scene_type)
-    frame = stage.look(camera, scale * width, scale * height)
+    frame = stage.look(camera.resized(scale * width, scale * height))
     lamp = light_camera(scene_type)
     # Size (m) of a pixel of the lamp's image
     texel = 2.0 * np.linalg.norm(np.subtract(lamp.position, lamp.target)) / lamp.height
     texel *= np.tan(np.radians(lamp.fov_y) / 2.0)
-    light = stage.look(lamp, lamp.width, lamp.height)
-    color = stage.paint(frame, framing.to_light)
-    if marked.any():
-        red = (frame.slots >= 0) & marked[np.maximum(frame.slots, 0)]
-        color = np.where(
-            red[..., None], 0.42 * color + 0.58 * _HIGHLIGHT * (color.mean(-1, keepdims=True) / 200.0), color
-        )
-    normals = surface_normals(frame)
-    shadow = soft_shadow(frame, light, normals, bias=1.3 * texel, lift=2.6 * texel)[..., None]
-    reach = 0.04 * np.sqrt(framing.radius / _TABLE)
-    shade = uniform_filter(contact_shade(frame, normals, radius=reach), 2 * scale + 1)[..., None]
-    towards = np.clip(2.0 * normals @ (frame.camera.view[:3, :3] @ framing.to_light).astype(np.float32), 0.0, 1.0)[
-        ..., None
-    ]
-    lit = color * (1.0 - _SHADOW * shadow * (0.4 + 0.6 * towards)) * (1.0 - np.minimum(1.25 * shade, 0.5))
-    ramp = np.linspace(0.0, 1.0, scale * height, dtype=np.float32)[:, None, None]
+    normals = stage.normals(camera)
+
+    samples = [frame.faces[row::scale, column::scale] for row in range(scale) for column in range(scale)]
+    first = samples[0]
+    plain = np.logical_and.reduce([first == other for other in samples[1:]])
+    rows, columns = np.nonzero(plain & (first >= 0))
+    mixed_rows, mixed_columns = np.nonzero(~plain)
+    down, across = np.indices((scale, scale)).reshape(2, 1, -1)
+    fine_rows = (scale * mixed_rows[:, None] + down).ravel()
+    fine_columns = (scale * mixed_columns[:, None] + across).ravel()
+    ramp = np.linspace(0.0, 1.0, scale * height, dtype=np.float32)[:, None]
     backdrop = _BACKDROP[0] * (1.0 - ramp) + _BACKDROP[1] * ramp
-    image = np.where((frame.slots >= 0)[..., None], lit, backdrop)
-    small = image.reshape(height, scale, width, scale, 3).mean(axis=(1, 3))
-    return np.rint(np.clip(small, 0.0, 255.0)).astype(np.uint8)
+    mixed = backdrop[fine_rows]
+    (solid,) = np.nonzero(frame.faces[fine_rows, fine_columns] >= 0)
+    fine_rows, fine_columns = fine_rows[solid], fine_columns[solid]
+
+    nearness = np.float32(1.0) / frame.depth
+    nearness = np.add.reduce([nearness[row::scale, column::scale] for row in range(scale) for column in range(scale)])
+    middle = np.float32(scale * scale) / nearness[rows, columns]
+    faces = np.concatenate([first[rows, columns], frame.faces[fine_rows, fine_columns]])
+    at = np.append(columns + 0.5, (fine_columns + 0.5) / scale), np.append(rows + 0.5, (fine_rows + 0.5) / scale)
+    points = camera.rays(*at) * np.append(middle, frame.depth[fine_rows, fine_columns])[:, None]
+    facing = normals[faces]
+    color = stage.paint(camera, faces, points, normals, framing.to_light)
+    if marked.any():
+        red = marked[stage.slot_of[faces]]
+        color[red] = 0.42 * color[red] + 0.58 * _HIGHLIGHT * (color[red].mean(-1, keepdims=True) / 200.0)
+    light = stage.look(to_pinhole(lamp))
+    # Points are raised off their surface, so that no surface shadows itself.
+    shadow = soft_shadow(points + np.float32(2.6 * texel) * facing, camera, light, 1.3 * texel)
+    grid = np.where(first >= 0, frame.depth[::scale, ::scale], 0.0)[..., None]
+    grid = grid * camera.rays(np.arange(width) + 0.5 / scale, (np.arange(height) + 0.5 / scale)[:, None])
+    contact = contact_shade(grid, normals[first], camera, 0.04 * np.sqrt(framing.radius / _TABLE))
+    of_row, of_column = np.append(rows, fine_rows // scale), np.append(columns, fine_columns // scale)
+    contact = uniform_filter(contact, 3)[of_row, of_column]
+    towards = np.clip(2.0 * facing @ (camera.view[:3, :3] @ framing.to_light).astype(np.float32), 0.0, 1.0)
+    color *= 1.0 - _SHADOW * (shadow * (0.4 + 0.6 * towards))[:, None]
+    color *= (1.0 - np.minimum(1.25 * contact, 0.5))[:, None]
+
+    image = np.empty((height, width, 3), dtype=np.float32)
+    image[:] = backdrop.reshape(height, scale, 3).mean(axis=1)[:, None]
+    image[rows, columns] = color[: len(rows)]
+    mixed[solid] = color[len(rows) :]
+    image[mixed_rows, mixed_columns] = mixed.reshape(-1, scale * scale, 3).mean(axis=1)
+    return np.rint(np.clip(image, 0.0, 255.0)).astype(np.uint8)
 
 
 def gallery(
