@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 from scene_envs.registry import lazy_names
 
 if TYPE_CHECKING:
-    from scene_envs.render.pictures import gallery, render
+    from scene_envs.render.pictures import gallery, observe, render
     from scene_envs.render.raster import Pinhole
-    from scene_envs.render.sensors import observe
     from scene_envs.render.stage import picture_camera
     from scene_envs.render.viewer import LiveViewer, viewer_page, write_viewer
 

@@ -1,18 +1,20 @@
-"""Lit pictures of scenes, and pages of several."""
+"""Lit pictures of scenes, what sensors see of them, and pages of several pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import torch
+from gymnasium import logger
 from numpy.typing import NDArray
 
 from scene_envs.arrays import Array, Index
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.render.raster import Pinhole
 from scene_envs.render.stage import (
+    Frame,
     Stage,
     contact_shade,
     frame_scene_type,
@@ -30,7 +32,10 @@ if TYPE_CHECKING:
     from PIL import Image
 
 
+Mode = Literal["rgb", "depth", "instance", "boxes", "category", "semantic", "normals"]
+MODES: tuple[Mode, ...] = get_args(Mode)
 _BACKDROP = np.array([[250.0, 249.0, 247.0], [226.0, 230.0, 235.0]], dtype=np.float32)
+_BACKGROUND = (255, 255, 255)
 _HIGHLIGHT = np.array([226.0, 52.0, 40.0], dtype=np.float32)
 _SHADOW = np.array([0.40, 0.38, 0.34], dtype=np.float32)
 """Share of red, green and blue that a full shadow takes away."""
@@ -50,7 +55,7 @@ def render(
 ) -> NDArray[np.uint8]:
     """Lit pictures of scenes with soft shadows, drawn in software; no display, GPU or simulator is needed.
 
-    :func:`~scene_envs.render.sensors.observe` gives depth, masks and other images of the same scenes.
+    :func:`~scene_envs.render.pictures.observe` gives depth, masks and other images of the same scenes.
 
     Args:
         batch: B scenes.
@@ -78,6 +83,82 @@ def render(
     return images
 
 
+def observe(
+    batch: SceneBatch,
+    cameras: Sequence[Camera | Pinhole] | None = None,
+    modes: Sequence[Mode] = ("rgb", "depth", "instance", "category", "normals"),
+) -> list[dict[Mode, NDArray[Any]]]:
+    """What cameras see of scenes, drawn in software; no display, GPU or simulator is needed.
+
+    A pixel shows what the ray through its middle meets first; only ``rgb`` is smoothed.
+
+    | mode | image |
+    |---|---|
+    | ``rgb`` | (B, H, W, 3) uint8, the lit picture of :func:`~scene_envs.render.pictures.render` |
+    | ``depth`` | (B, H, W) float32, distance along the optical axis, m; inf where nothing is seen |
+    | ``instance`` | (B, H, W) int32, slot of the object; -1 where nothing is seen |
+    | ``boxes`` | (B, N, 4) int32, left, top, right, bottom of the visible part of each slot, pixels, the last two \\
+exclusive; 0 for slots that are not seen |
+    | ``category`` | (B, H, W) int32, category of the object; that of empty slots where nothing is seen |
+    | ``semantic`` | (B, H, W, 3) uint8, one flat color per asset on white, as the paper renders scenes |
+    | ``normals`` | (B, H, W, 3) float32, unit normals of triangles, world frame, on the side that is seen; 0 where \\
+nothing is seen |
+
+    Args:
+        batch: B scenes.
+        cameras: Cameras by place and target, or by intrinsics and pose; the one of the scene type by default, which
+            is the paper's.
+        modes: Images to make.
+
+    Returns:
+        The images by mode, for each camera.
+
+    Raises:
+        UnknownNameError: no such mode.
+        InvalidInputError: a camera without a direction, or one that is inside an object.
+
+    >>> from scene_envs import SceneBatch, get_scene_type
+    >>> empty_table = SceneBatch.empty(get_scene_type("dimsum_table"), 1)
+    >>> camera = Camera((0.0, 0.0, 2.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), width=5, height=3)
+    >>> (view,) = observe(empty_table, [camera], ["depth", "boxes"])
+    >>> view["depth"][0, 1].round(3).tolist(), view["boxes"][0, 0].tolist()
+    ([inf, 2.0, 2.0, 2.0, inf], [1, 0, 4, 3])
+    """
+    views = list(observe_each(batch if len(batch) else SceneBatch.empty(batch.scene_type, 1), cameras, modes))
+    return [
+        {mode: np.stack([view[index][mode] for view in views])[: len(batch)] for mode in modes}
+        for index in range(len(views[0]))
+    ]
+
+
+def observe_each(
+    batch: SceneBatch, cameras: Sequence[Camera | Pinhole] | None, modes: Sequence[Mode]
+) -> Iterator[list[dict[Mode, NDArray[Any]]]]:
+    """The images of :func:`observe`, without their first axis, scene by scene."""
+    for mode in modes:
+        if mode not in MODES:
+            raise unknown_name("image mode", mode, MODES)
+    scene_type = batch.scene_type
+    pinholes = [to_pinhole(camera) for camera in ([scene_type.camera] if cameras is None else cameras)]
+    places = [camera.pose[:3, 3].round(4).tolist() for camera in pinholes]
+    unseen = set(range(len(pinholes)))
+    for scene, (stage, (_, _, categories)) in enumerate(stages(batch)):
+        for index, camera in enumerate(pinholes):
+            if (slot := stage.enclosing_slot(camera.pose[:3, 3])) >= 0:
+                raise InvalidInputError(
+                    f"camera {index} at {places[index]} is inside the {scene_type.assets[categories[slot]]!r} in slot "
+                    f"{slot} of scene {scene}: give it another place, or leave the scene out"
+                )
+        frames = [stage.look(camera) for camera in pinholes]
+        unseen -= {index for index, frame in enumerate(frames) if (frame.slots >= 0).any()}
+        yield [{mode: _image(mode, stage, frame, categories, scene_type) for mode in modes} for frame in frames]
+    for index in sorted(unseen) if bool((batch.counts > 0).any()) else ():
+        logger.warn(
+            f"camera {index} at {places[index]} sees no object of {len(batch)} scenes: it looks away from them, or "
+            "they are beside its image"
+        )
+
+
 def stages(batch: SceneBatch) -> Iterator[tuple[Stage, tuple[Array, Array, Index]]]:
     """For each scene, the stage with its objects, which is the same one, and their translations (N, 3) m, rotations
     (N, 3, 3) and categories (N,).
@@ -99,6 +180,27 @@ def _as_mask(highlight: torch.Tensor | NDArray[np.bool_] | None, batch: SceneBat
     if mask.shape != shape:
         raise InvalidInputError(f"highlight marks objects of the batch, so its shape is {shape}; got {mask.shape}")
     return mask.astype(bool)
+
+
+def _image(mode: Mode, stage: Stage, frame: Frame, categories: Index, scene_type: SceneType) -> NDArray[Any]:
+    """One image of what ``frame`` holds of the scene on the stage, whose slots have ``categories`` (N,)."""
+    if mode == "rgb":
+        return draw_picture(stage, frame.camera, scene_type, np.zeros(len(categories), dtype=bool))
+    if mode in ("depth", "instance"):
+        return frame.depth if mode == "depth" else frame.slots.astype(np.int32)
+    if mode == "boxes":
+        from scipy.ndimage import find_objects
+
+        areas = find_objects(frame.slots + 1, len(categories))
+        boxes = [(a[1].start, a[0].start, a[1].stop, a[0].stop) if a else (0, 0, 0, 0) for a in areas]
+        return np.array(boxes, dtype=np.int32)
+    if mode == "normals":
+        return (stage.normals(frame.camera) @ frame.camera.view[:3, :3].astype(np.float32))[frame.faces]
+    category = np.append(categories, scene_type.num_assets)[frame.slots]
+    if mode == "category":
+        return category.astype(np.int32)
+    colors = [*(asset.color for asset in scene_type.library), _BACKGROUND]
+    return np.array(colors, dtype=np.uint8)[category]
 
 
 def draw_picture(stage: Stage, camera: Pinhole, scene_type: SceneType, marked: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -16,26 +16,23 @@ _CHUNK = 1 << 17
 
 @dataclass(frozen=True, eq=False)
 class Pinhole:
-    """A pinhole camera by its intrinsics and its pose, with the axes of OpenCV: x right, y down, z along the view.
+    """A pinhole camera by intrinsics and pose, with the axes of OpenCV: x right, y down, z forward along the view.
 
     Attributes:
-        pose: (4, 4) transform from the camera frame to the world; its columns are the directions right, down and
-            forward, and the position (m).
+        pose: (4, 4) transform from the camera frame to the world: columns right, down, forward and position (m).
         fx: Focal length along rows of the image, pixels.
         fy: Focal length along columns of the image, pixels.
-        cx: Column of the principal point, pixels from the left border. The middle of the first pixel is at 0.5; a
-            calibration that has it at 0, as OpenCV's, needs 0.5 more.
-        cy: Row of the principal point, pixels from the upper border, as ``cx``.
+        cx: Principal point from the left border, pixels. The middle of the first pixel is at 0.5; a calibration that
+            has it at 0, as OpenCV's, needs 0.5 more.
+        cy: Principal point from the upper border, pixels, counted in the same way.
         width: Image width, pixels.
         height: Image height, pixels.
-        near: Depth (m) below which nothing is seen.
+        near: Depth (m) up to which nothing is seen.
 
     Raises:
-        InvalidInputError: a pose that is no rigid motion, or a focal length, size or near plane that is not above 0.
+        InvalidInputError: a pose that is no rigid motion, or a focal length, size or near depth that is not above 0.
 
     >>> camera = Pinhole.at((0.0, 0.0, 2.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 90.0, 20, 10)
-    >>> round(camera.fx, 9), round(camera.fy, 9), camera.cx, camera.cy
-    (5.0, 5.0, 10.0, 5.0)
     >>> (camera.view @ [1.0, 0.5, 0.0, 1.0]).round(9).tolist()  # right, down, forward
     [1.0, -0.5, 2.0, 1.0]
     """
@@ -52,23 +49,16 @@ class Pinhole:
     def __post_init__(self) -> None:
         pose = np.array(self.pose, dtype=np.float64)
         object.__setattr__(self, "pose", pose)
-        if pose.shape != (4, 4) or not np.isfinite(pose).all() or (np.abs(pose[3] - [0, 0, 0, 1]) > 1e-6).any():
+        turn = pose[:3, :3] if pose.shape == (4, 4) and np.isfinite(pose).all() else np.zeros((3, 3))
+        if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0 or (pose[3] != [0, 0, 0, 1]).any():
             raise InvalidInputError(
-                f"the pose of a camera is a finite (4, 4) matrix with the last row 0 0 0 1, got {pose.tolist()}"
+                "the pose of a camera is a (4, 4) rigid motion of the columns right, down, forward, position, with the "
+                f"last row 0 0 0 1; got {pose.tolist()}"
             )
-        turn = pose[:3, :3]
-        if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0.0:
-            raise InvalidInputError(
-                f"the first three columns of a camera's pose are unit vectors right, down, forward, got {turn.tolist()}"
-            )
-        for name in ("fx", "fy", "near"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise InvalidInputError(f"a camera's {name} must be above 0, got {name}={getattr(self, name)}")
-        if not np.isfinite([self.cx, self.cy]).all():
-            raise InvalidInputError(f"a camera's principal point must be finite, got cx={self.cx}, cy={self.cy}")
-        if self.width < 1 or self.height < 1:
-            size = f"width={self.width}, height={self.height}"
-            raise InvalidInputError(f"an image needs at least 1 x 1 pixels, got {size}")
+        for name in ("fx", "fy", "cx", "cy", "width", "height", "near"):
+            if not (-np.inf if name in ("cx", "cy") else 0.0) < getattr(self, name) < np.inf:
+                wanted = "finite" if name in ("cx", "cy") else "above 0"
+                raise InvalidInputError(f"{name} of a camera must be {wanted}, got {name}={getattr(self, name)}")
 
     @classmethod
     def at(
@@ -105,8 +95,7 @@ class Pinhole:
     @property
     def view(self) -> Array:
         """(4, 4) transform from the world to the camera frame."""
-        view: Array = np.linalg.inv(self.pose)
-        return view
+        return np.asarray(np.linalg.inv(self.pose), dtype=np.float64)
 
     def resized(self, width: int, height: int) -> Pinhole:
         """The same view in another number of pixels; another aspect stretches the image."""
@@ -119,16 +108,12 @@ class Pinhole:
         return np.stack([columns, rows, np.ones_like(rows)], axis=-1).astype(np.float32)
 
 
-def visible_triangles(
-    points: Array, faces: Index, camera: Pinhole, sides: NDArray[np.int8] | None = None
-) -> tuple[Index, NDArray[np.float32]]:
+def visible_triangles(points: Array, faces: Index, camera: Pinhole) -> tuple[Index, NDArray[np.float32]]:
     """The nearest triangle through the centre of each pixel.
 
-    Triangles have corners ``faces`` (T, 3) among the points (V, 3), in the camera frame in m. Those with ``sides`` (T,)
-    0, or all without ``sides``, are seen from both sides; 1 is for those that are seen only from where their corners
-    turn to the left, -1 for the others. Two triangles that share an edge leave no gap, and no pixel centre belongs to
-    both. The results are the (H, W) index of the triangle, -1 without one; and the (H, W) float32 depth along the view
-    (m), inf without one.
+    Triangles have corners ``faces`` (T, 3) among ``points`` (V, 3), camera frame in m, and are seen from both sides.
+    Two that share an edge leave no gap, and no pixel centre belongs to both. The results are the (H, W) index of the
+    triangle, -1 without one; and the (H, W) float32 depth along the view (m), inf without one.
 
     >>> camera = Pinhole(np.eye(4), 2.0, 2.0, 2.0, 2.0, 4, 4)
     >>> corners = np.array([[-9.0, 0.0, 2.0], [9.0, 0.0, 2.0], [0.0, 9.0, 2.0]])
@@ -148,11 +133,9 @@ def visible_triangles(
     column = points[:, 0] * nearness * camera.fx + camera.cx
     row = points[:, 1] * nearness * camera.fy + camera.cy
     x, y = column[corners], row[corners]
-    area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])  # twice, below 0 where corners turn left
+    area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     first, last = _pixels(y.min(axis=0), camera.height), _pixels(y.max(axis=0), camera.height)
     kept = (np.abs(area) > 1e-12) & (last > first) & (x.max(axis=0) > 0.5) & (x.min(axis=0) < camera.width)
-    if sides is not None:
-        kept &= area * sides[owners] <= 0.0
     (kept_at,) = np.nonzero(kept)
     owners, first, last = owners[kept_at], first[kept_at], last[kept_at]
     top, middle, bottom = corners[:, kept_at]

@@ -71,14 +71,12 @@ class Stage:
         faces = (model.faces + start for model, start in zip(models, starts, strict=False))
         self._faces = np.concatenate([none.astype(np.int64), *faces])
         self._slots, self._starts = slots, starts[:-1]
-        counts = [len(model.faces) for model in models]
-        self.slot_of = np.repeat(np.array(slots, dtype=np.int64), counts)  # (F,) the slot of each triangle
-        mirrored = np.sign(np.linalg.det(rotations[slots])) if slots else np.empty(0)
-        self._sides = np.repeat([model.side for model in models] * mirrored, counts).astype(np.int8)
+        # (F,): the slot of each triangle
+        self.slot_of = np.repeat(np.array(slots, dtype=np.int64), [len(model.faces) for model in models])
 
     def look(self, camera: Pinhole) -> Frame:
         """What ``camera`` sees of the placed objects."""
-        faces, depth = visible_triangles(self._points(camera), self._faces, camera, self._sides)
+        faces, depth = visible_triangles(self._points(camera), self._faces, camera)
         slots = np.append(self.slot_of, -1)[faces]
         return Frame(depth, slots, faces, camera)
 
@@ -135,13 +133,11 @@ class Stage:
         if category not in self._models:
             asset = self._library[category]
             mesh = asset.visual
-            vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
             self._models[category] = _Model(
-                vertices,
+                np.asarray(mesh.vertices, dtype=np.float64),
                 np.asarray(mesh.vertex_normals, dtype=np.float64),
                 vertex_colors(asset).astype(np.float64),
-                faces,
-                int(is_closed(vertices[faces])),
+                np.asarray(mesh.faces, dtype=np.int64),
             )
         return self._models[category]
 
@@ -152,7 +148,6 @@ class _Model:
     normals: Array  # (V, 3), unit vectors
     colors: Array  # (V, 3), 0..255
     faces: Index  # (F, 3)
-    side: int  # 1 for a closed surface, which is never seen from inside; 0 for others
 
 
 get_stage = cache(Stage)
@@ -160,8 +155,8 @@ get_stage = cache(Stage)
 
 
 def winding_number(triangles: Array, point: Array) -> float:
-    """How often triangles (F, 3, 3) that turn to the left seen from outside enclose a point (3,): 1 inside a closed
-    surface, 0 outside, and a fraction near an open one. (Van Oosterom and Strackee, 1983.)
+    """How often triangles (F, 3, 3) enclose a point (3,): 1 in a closed surface, -1 in one with its inside out, 0 outside,
+    and a fraction near an open one (Van Oosterom and Strackee, 1983).
     """
     a, b, c = (triangles - point).swapaxes(0, 1)
     ab, bc, ca = (np.einsum("fk,fk->f", *pair) for pair in ((a, b), (b, c), (c, a)))
@@ -169,21 +164,6 @@ def winding_number(triangles: Array, point: Array) -> float:
     volume = np.einsum("fk,fk->f", a, np.cross(b, c))
     rest = a_length * b_length * c_length + ab * c_length + bc * a_length + ca * b_length
     return float(np.arctan2(volume, rest).sum() / (2.0 * np.pi))
-
-
-def is_closed(triangles: Array, probes: int = 24) -> bool:
-    """Whether triangles (F, 3, 3) close a surface with its outside to the left: just under some of them, spread evenly,
-    the winding number is a whole one. T-junctions, which edges of a mesh do not show to be closed, are no hole.
-    """
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    areas = np.linalg.norm(normals, axis=1)
-    (chosen,) = np.nonzero(areas > 1e-3 * areas.mean())
-    depth = 1e-4 * np.ptp(triangles, axis=(0, 1)).max()
-    for face in chosen[:: max(1, len(chosen) // probes)]:
-        number = winding_number(triangles, triangles[face].mean(axis=0) - depth * normals[face] / areas[face])
-        if number < 0.5 or abs(number - round(number)) > 1e-6:
-            return False
-    return len(chosen) > 0
 
 
 def vertex_colors(asset: Asset) -> NDArray[np.uint8]:

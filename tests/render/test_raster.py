@@ -25,9 +25,9 @@ def rays(camera):
     return np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], axis=-1)
 
 
-def visible(triangles, camera=ALONG, sides=None):
+def visible(triangles, camera=ALONG):
     """What the camera sees of triangles (T, 3, 3) in its frame."""
-    return visible_triangles(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), camera, sides)
+    return visible_triangles(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), camera)
 
 
 def test_a_sphere_covers_the_disc_that_its_tangent_cone_cuts():
@@ -83,19 +83,6 @@ def test_neighbours_leave_no_gap_and_do_not_overlap(seed):
     np.testing.assert_allclose(depth[inside], expected[inside], rtol=1e-5)
     single = np.concatenate([visible(triangles[k::7])[0].ravel() for k in range(7)])
     assert (single >= 0).sum() == (faces >= 0).sum()  # each pixel belongs to one triangle
-
-
-def test_triangles_of_one_side_are_seen_from_where_their_corners_turn_left():
-    sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
-    triangles = sphere.triangles + np.array([0.0, 0.0, 2.0])
-    outer, inner = (visible(triangles, sides=np.full(len(triangles), side, np.int8)) for side in (1, -1))
-    both = visible(triangles)
-    np.testing.assert_array_equal(outer[0], both[0])
-    np.testing.assert_array_equal(outer[1], both[1])
-    np.testing.assert_array_equal(np.isfinite(inner[1]), np.isfinite(both[1]))
-    seen = np.isfinite(inner[1])
-    assert (inner[1][seen] > both[1][seen]).mean() > 0.99
-    assert inner[1][50, 100] == pytest.approx(2.5, abs=0.01)
 
 
 def test_colors_are_interpolated_in_the_triangle_and_not_in_the_image():
@@ -167,14 +154,14 @@ def test_a_camera_without_a_direction_is_refused():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"fx": 0.0}, "fx must be above 0, got fx=0.0"),
-        ({"fy": -3.0}, "fy must be above 0, got fy=-3.0"),
-        ({"near": 0.0}, "near must be above 0"),
-        ({"cx": np.nan}, "principal point must be finite, got cx=nan"),
-        ({"width": 0}, "at least 1 x 1 pixels, got width=0"),
-        ({"pose": np.eye(3)}, r"finite \(4, 4\) matrix"),
-        ({"pose": np.diag([1.0, 1.0, -1.0, 1.0])}, "unit vectors right, down, forward"),
-        ({"pose": np.diag([2.0, 2.0, 2.0, 1.0])}, "unit vectors right, down, forward"),
+        ({"fx": 0.0}, "fx of a camera must be above 0, got fx=0.0"),
+        ({"fy": -3.0}, "fy of a camera must be above 0, got fy=-3.0"),
+        ({"near": 0.0}, "near of a camera must be above 0"),
+        ({"cx": np.nan}, "cx of a camera must be finite, got cx=nan"),
+        ({"width": 0}, "width of a camera must be above 0, got width=0"),
+        ({"pose": np.eye(3)}, r"\(4, 4\) rigid motion"),
+        ({"pose": np.diag([1.0, 1.0, -1.0, 1.0])}, "rigid motion"),
+        ({"pose": np.diag([2.0, 2.0, 2.0, 1.0])}, "rigid motion"),
     ],
 )
 def test_impossible_cameras_are_refused(values, message):

@@ -12,7 +12,7 @@ from trimesh.ray.ray_triangle import ray_triangle_id
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar
 from scene_envs.render import Pinhole, observe, picture_camera, render
-from scene_envs.render.sensors import MODES
+from scene_envs.render.pictures import MODES
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, get_scene_type
 

@@ -17,7 +17,6 @@ from scene_envs.render.stage import (
     contact_shade,
     fit_camera,
     frame_scene_type,
-    is_closed,
     light_camera,
     scene_type_of_one,
     soft_shadow,
@@ -228,16 +227,3 @@ def test_the_winding_number_counts_how_often_a_surface_encloses_a_point():
     cube = trimesh.creation.box((1.0, 1.0, 1.0))
     half = cube.triangles[cube.face_normals[:, 2] < 0.5]  # without its top, a sixth of what its middle sees
     assert winding_number(half, np.zeros(3)) == pytest.approx(5.0 / 6.0)
-
-
-def test_only_closed_surfaces_lose_their_inner_side():
-    """A box of which one side is cut otherwise than its neighbours is closed, an open or inverted one is not."""
-    box = trimesh.creation.box((1.0, 1.0, 1.0))
-    top = box.face_normals[:, 2] > 0.5
-    corners = np.array([[x, y, 0.5] for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.0), (0.5, 0.5), (-0.5, 0.5))])
-    fan = np.array([[corners[0], corners[k], corners[k + 1]] for k in (1, 2, 3)])
-    assert is_closed(box.triangles)
-    assert is_closed(np.concatenate([box.triangles[~top], fan]))
-    assert not is_closed(box.triangles[~top])
-    assert not is_closed(box.triangles[:, ::-1])
-    assert not is_closed(np.concatenate([box.triangles, 0.3 * box.triangles[:, ::-1] + 2.0]))
