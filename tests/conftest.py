@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import sys
 from collections.abc import Iterator
@@ -62,7 +61,7 @@ def _coarse_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
 
     def coarse_lamp(scene_type: Any) -> Any:
         camera = lamp(scene_type)
-        return dataclasses.replace(camera, width=camera.width // 4, height=camera.height // 4)
+        return camera.resized(camera.width // 4, camera.height // 4)
 
     monkeypatch.setattr(pictures, "draw_picture", coarse)
     monkeypatch.setattr(pictures, "light_camera", coarse_lamp)

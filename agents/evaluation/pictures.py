@@ -118,8 +118,7 @@ def class_images(batches: list[SceneBatch], width: int, height: int) -> tuple[Te
     """(B, H, W) uint8 indices of the colours of the semantic renders of all scenes, and the number of colours."""
     from scene_envs.render import observe
 
-    cameras = [replace(batch.scene_type.camera, width=width, height=height) for batch in batches]
-    views = [observe(batch, [camera], ["semantic"]) for batch, camera in zip(batches, cameras, strict=True)]
+    views = [observe(b, [replace(b.scene_type.camera, width=width, height=height)], ["semantic"]) for b in batches]
     images = np.concatenate([view["semantic"] for (view,) in views])
     red, green, blue = np.moveaxis(images.astype(np.int32), -1, 0)
     colors, index = np.unique((red << 16) | (green << 8) | blue, return_inverse=True)

@@ -35,11 +35,9 @@ if TYPE_CHECKING:
 Mode = Literal["rgb", "depth", "instance", "boxes", "category", "semantic", "normals"]
 MODES: tuple[Mode, ...] = get_args(Mode)
 _BACKDROP = np.array([[250.0, 249.0, 247.0], [226.0, 230.0, 235.0]], dtype=np.float32)
-_BACKGROUND = (255, 255, 255)
 _HIGHLIGHT = np.array([226.0, 52.0, 40.0], dtype=np.float32)
 _SHADOW = np.array([0.40, 0.38, 0.34], dtype=np.float32)
 """Share of red, green and blue that a full shadow takes away."""
-_SUPERSAMPLING = 2
 _TABLE = 0.68
 """Radius (m) of the framing of a dim sum table, for which contact shading is tuned."""
 _PAGE, _INK = (255, 255, 255), (58, 62, 70)
@@ -135,9 +133,8 @@ def observe_each(
     batch: SceneBatch, cameras: Sequence[Camera | Pinhole] | None, modes: Sequence[Mode]
 ) -> Iterator[list[dict[Mode, NDArray[Any]]]]:
     """The images of :func:`observe`, without their first axis, scene by scene."""
-    for mode in modes:
-        if mode not in MODES:
-            raise unknown_name("image mode", mode, MODES)
+    for mode in set(modes) - set(MODES):
+        raise unknown_name("image mode", mode, MODES)
     scene_type = batch.scene_type
     pinholes = [to_pinhole(camera) for camera in ([scene_type.camera] if cameras is None else cameras)]
     places = [camera.pose[:3, 3].round(4).tolist() for camera in pinholes]
@@ -160,9 +157,7 @@ def observe_each(
 
 
 def stages(batch: SceneBatch) -> Iterator[tuple[Stage, tuple[Array, Array, Index]]]:
-    """For each scene, the stage with its objects, which is the same one, and their translations (N, 3) m, rotations
-    (N, 3, 3) and categories (N,).
-    """
+    """The stage with each scene on it, and the translations (N, 3) m, rotations (N, 3, 3) and categories (N,) of it."""
     translations = batch.translations.detach().cpu().double().numpy()
     rotations = batch.rotations.detach().cpu().double().numpy()
     categories = batch.categories.detach().cpu().numpy()
@@ -196,11 +191,9 @@ def _image(mode: Mode, stage: Stage, frame: Frame, categories: Index, scene_type
         return np.array(boxes, dtype=np.int32)
     if mode == "normals":
         return (stage.normals(frame.camera) @ frame.camera.view[:3, :3].astype(np.float32))[frame.faces]
-    category = np.append(categories, scene_type.num_assets)[frame.slots]
-    if mode == "category":
-        return category.astype(np.int32)
-    colors = [*(asset.color for asset in scene_type.library), _BACKGROUND]
-    return np.array(colors, dtype=np.uint8)[category]
+    category = np.append(categories, scene_type.num_assets).astype(np.int32)[frame.slots]
+    colors = [*(asset.color for asset in scene_type.library), (255, 255, 255)]
+    return category if mode == "category" else np.array(colors, dtype=np.uint8)[category]
 
 
 def draw_picture(stage: Stage, camera: Pinhole, scene_type: SceneType, marked: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -209,57 +202,49 @@ def draw_picture(stage: Stage, camera: Pinhole, scene_type: SceneType, marked: N
     """
     from scipy.ndimage import uniform_filter
 
-    height, width, scale = camera.height, camera.width, _SUPERSAMPLING
+    height, width = camera.height, camera.width
     framing = frame_scene_type(scene_type)
-    frame = stage.look(camera.resized(scale * width, scale * height))
-    lamp = light_camera(scene_type)
+    frame, light = stage.look(camera.resized(2 * width, 2 * height)), stage.look(light_camera(scene_type))
     # Size (m) of a pixel of the lamp's image
-    texel = 2.0 * np.linalg.norm(np.subtract(lamp.position, lamp.target)) / lamp.height
-    texel *= np.tan(np.radians(lamp.fov_y) / 2.0)
+    texel = float(np.linalg.norm(light.camera.pose[:3, 3] - framing.center) / light.camera.fx)
     normals = stage.normals(camera)
 
-    samples = [frame.faces[row::scale, column::scale] for row in range(scale) for column in range(scale)]
-    first = samples[0]
-    plain = np.logical_and.reduce([first == other for other in samples[1:]])
+    first = frame.faces[::2, ::2]
+    plain = np.logical_and.reduce([first == frame.faces[row::2, column::2] for row, column in ((0, 1), (1, 0), (1, 1))])
     rows, columns = np.nonzero(plain & (first >= 0))
     mixed_rows, mixed_columns = np.nonzero(~plain)
-    down, across = np.indices((scale, scale)).reshape(2, 1, -1)
-    fine_rows = (scale * mixed_rows[:, None] + down).ravel()
-    fine_columns = (scale * mixed_columns[:, None] + across).ravel()
-    ramp = np.linspace(0.0, 1.0, scale * height, dtype=np.float32)[:, None]
+    fine_rows = (2 * mixed_rows[:, None] + [0, 0, 1, 1]).ravel()
+    fine_columns = (2 * mixed_columns[:, None] + [0, 1, 0, 1]).ravel()
+    ramp = np.linspace(0.0, 1.0, 2 * height, dtype=np.float32)[:, None]
     backdrop = _BACKDROP[0] * (1.0 - ramp) + _BACKDROP[1] * ramp
     mixed = backdrop[fine_rows]
     (solid,) = np.nonzero(frame.faces[fine_rows, fine_columns] >= 0)
     fine_rows, fine_columns = fine_rows[solid], fine_columns[solid]
 
-    nearness = np.float32(1.0) / frame.depth
-    nearness = np.add.reduce([nearness[row::scale, column::scale] for row in range(scale) for column in range(scale)])
-    middle = np.float32(scale * scale) / nearness[rows, columns]
-    faces = np.concatenate([first[rows, columns], frame.faces[fine_rows, fine_columns]])
-    at = np.append(columns + 0.5, (fine_columns + 0.5) / scale), np.append(rows + 0.5, (fine_rows + 0.5) / scale)
-    points = camera.rays(*at) * np.append(middle, frame.depth[fine_rows, fine_columns])[:, None]
+    depth = 0.5 * (frame.depth[::2, ::2] + frame.depth[1::2, 1::2])[rows, columns]
+    faces = np.append(first[rows, columns], frame.faces[fine_rows, fine_columns])
+    at = np.append(columns + 0.5, 0.5 * fine_columns + 0.25), np.append(rows + 0.5, 0.5 * fine_rows + 0.25)
+    points = camera.rays(*at) * np.append(depth, frame.depth[fine_rows, fine_columns])[:, None]
     facing = normals[faces]
     color = stage.paint(camera, faces, points, normals, framing.to_light)
     if marked.any():
         red = marked[stage.slot_of[faces]]
         color[red] = 0.42 * color[red] + 0.58 * _HIGHLIGHT * (color[red].mean(-1, keepdims=True) / 200.0)
-    light = stage.look(to_pinhole(lamp))
     # Points are raised off their surface, so that no surface shadows itself.
     shadow = soft_shadow(points + np.float32(2.6 * texel) * facing, camera, light, 1.3 * texel)
-    grid = np.where(first >= 0, frame.depth[::scale, ::scale], 0.0)[..., None]
-    grid = grid * camera.rays(np.arange(width) + 0.5 / scale, (np.arange(height) + 0.5 / scale)[:, None])
+    grid = camera.rays(np.arange(width) + 0.25, (np.arange(height) + 0.25)[:, None])
+    grid *= np.where(first >= 0, frame.depth[::2, ::2], 0.0)[..., None]
     contact = contact_shade(grid, normals[first], camera, 0.04 * np.sqrt(framing.radius / _TABLE))
-    of_row, of_column = np.append(rows, fine_rows // scale), np.append(columns, fine_columns // scale)
-    contact = uniform_filter(contact, 3)[of_row, of_column]
+    contact = uniform_filter(contact, 3)[np.append(rows, fine_rows // 2), np.append(columns, fine_columns // 2)]
     towards = np.clip(2.0 * facing @ (camera.view[:3, :3] @ framing.to_light).astype(np.float32), 0.0, 1.0)
     color *= 1.0 - _SHADOW * (shadow * (0.4 + 0.6 * towards))[:, None]
     color *= (1.0 - np.minimum(1.25 * contact, 0.5))[:, None]
 
     image = np.empty((height, width, 3), dtype=np.float32)
-    image[:] = backdrop.reshape(height, scale, 3).mean(axis=1)[:, None]
+    image[:] = backdrop.reshape(height, 2, 3).mean(axis=1)[:, None]
     image[rows, columns] = color[: len(rows)]
     mixed[solid] = color[len(rows) :]
-    image[mixed_rows, mixed_columns] = mixed.reshape(-1, scale * scale, 3).mean(axis=1)
+    image[mixed_rows, mixed_columns] = mixed.reshape(-1, 4, 3).mean(axis=1)
     return np.rint(np.clip(image, 0.0, 255.0)).astype(np.uint8)
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scene_envs.arrays import Array, Index, ranges
 from scene_envs.errors import InvalidInputError
 
+Triple = tuple[float, float, float]
 _CHUNK = 1 << 17
 """Pixels of triangles that are tested at once: their arrays stay in the processor's cache."""
 
@@ -61,15 +62,7 @@ class Pinhole:
                 raise InvalidInputError(f"{name} of a camera must be {wanted}, got {name}={getattr(self, name)}")
 
     @classmethod
-    def at(
-        cls,
-        position: tuple[float, float, float],
-        target: tuple[float, float, float],
-        up: tuple[float, float, float],
-        fov_y: float,
-        width: int,
-        height: int,
-    ) -> Pinhole:
+    def at(cls, position: Triple, target: Triple, up: Triple, fov_y: float, width: int, height: int) -> Pinhole:
         """The camera at ``position`` (m) that looks at ``target`` (m), with a vertical field of view in degrees.
 
         Raises InvalidInputError where position and target are the same point, or ``up`` is along the view, or the field
@@ -135,27 +128,22 @@ def visible_triangles(points: Array, faces: Index, camera: Pinhole) -> tuple[Ind
     x, y = column[corners], row[corners]
     area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     first, last = _pixels(y.min(axis=0), camera.height), _pixels(y.max(axis=0), camera.height)
-    kept = (np.abs(area) > 1e-12) & (last > first) & (x.max(axis=0) > 0.5) & (x.min(axis=0) < camera.width)
-    (kept_at,) = np.nonzero(kept)
-    owners, first, last = owners[kept_at], first[kept_at], last[kept_at]
-    top, middle, bottom = corners[:, kept_at]
-    for _ in range(2):  # from the top down
-        top, middle = _sorted(row, top, middle)
-        middle, bottom = _sorted(row, middle, bottom)
+    in_image = (last > first) & (x.max(axis=0) > 0.5) & (x.min(axis=0) < camera.width)
+    (kept_at,) = np.nonzero(in_image & (np.abs(area) > 1e-12))
+    owners, first, last, corners = owners[kept_at], first[kept_at], last[kept_at], corners[:, kept_at]
+    corners = np.take_along_axis(corners, np.argsort(row[corners], axis=0), axis=0)  # from the top down
 
     # On each line of pixels a triangle covers the span between its long edge and one of the two others; 1 / depth is
     # linear in the image. Neighbours compute the same end on their shared edge, whose upper corner is taken first.
-    x, y, q = (values[np.stack([top, middle, bottom])] for values in (column, row, nearness))
+    x, y, q = (values[corners] for values in (column, row, nearness))
     (ux, vx), (uy, vy), (uq, vq) = (values[1:] - values[0] for values in (x, y, q))
     area = ux * vy - vx * uy
     along, across, down = _slope(vx, vy), (uq * vy - vq * uy) / area, (ux * vq - vx * uq) / area
     split = _pixels(y[1], camera.height)
     of, rows = ranges(np.concatenate([first, split]), np.concatenate([split - first, last - split]))
-    lower = of >= len(owners)
-    beside = np.append(_slope(ux, uy), _slope(vx - ux, vy - uy))
-    edges = np.stack([x[:2].ravel(), y[:2].ravel(), beside])
-    x_short, y_short, beside = edges[:, of]
-    of -= lower * len(owners)
+    beside = np.append(_slope(ux, uy), _slope(vx - ux, vy - uy))  # of the upper and the lower short edges
+    x_short, y_short, beside = (values[of] for values in (x[:2].ravel(), y[:2].ravel(), beside))
+    of -= (of >= len(owners)) * len(owners)
     place = rows + 0.5
     rise = place - y[0][of]
     ends = x[0][of] + rise * along[of], x_short + (place - y_short) * beside
@@ -222,12 +210,6 @@ def _leave(inside: Array, outside: Array, near: float) -> Array:
 def _pixels(places: Array, size: int) -> Index:
     """The first pixel whose centre is not before each place, from 0 to ``size``."""
     return np.ceil(np.clip(places, 0, size) - 0.5).astype(np.int64)
-
-
-def _sorted(row: Array, first: Index, second: Index) -> tuple[Index, Index]:
-    """Two corners of each triangle, the upper one first."""
-    swap = row[first] > row[second]
-    return np.where(swap, second, first), np.where(swap, first, second)
 
 
 def _slope(x: Array, y: Array) -> Array:

@@ -77,8 +77,7 @@ class Stage:
     def look(self, camera: Pinhole) -> Frame:
         """What ``camera`` sees of the placed objects."""
         faces, depth = visible_triangles(self._points(camera), self._faces, camera)
-        slots = np.append(self.slot_of, -1)[faces]
-        return Frame(depth, slots, faces, camera)
+        return Frame(depth, np.append(self.slot_of, -1)[faces], faces, camera)
 
     def enclosing_slot(self, point: Array) -> int:
         """Slot of an object whose visual mesh encloses ``point`` (3,), m; -1 without one."""
@@ -155,8 +154,8 @@ get_stage = cache(Stage)
 
 
 def winding_number(triangles: Array, point: Array) -> float:
-    """How often triangles (F, 3, 3) enclose a point (3,): 1 in a closed surface, -1 in one with its inside out, 0 outside,
-    and a fraction near an open one (Van Oosterom and Strackee, 1983).
+    """How often triangles (F, 3, 3) enclose a point (3,): 1 in a closed surface, -1 in one turned inside out, 0 out of
+    both, and a fraction near an open one (Van Oosterom and Strackee, 1983).
     """
     a, b, c = (triangles - point).swapaxes(0, 1)
     ab, bc, ca = (np.einsum("fk,fk->f", *pair) for pair in ((a, b), (b, c), (c, a)))
@@ -342,14 +341,12 @@ def picture_camera(scene_type: str | SceneType, width: int = 480, height: int = 
     return Camera(_triple(position), _triple(target), (0.0, 0.0, 1.0), width, height, _FOV)
 
 
-def light_camera(scene_type: SceneType) -> Camera:
+def light_camera(scene_type: SceneType) -> Pinhole:
     """The view from a far lamp that sees the whole workspace."""
     framing = frame_scene_type(scene_type)
-    distance = 8.0 * framing.radius
-    fov = 2.0 * np.degrees(np.arctan(1.1 * framing.radius / distance))
-    pixels = _LAMP_PIXELS[framing.radius > 2.0]
-    position = framing.center + distance * framing.to_light
-    return Camera(_triple(position), _triple(framing.center), (0.0, 1.0, 0.0), pixels, pixels, float(fov))
+    position = framing.center + 8.0 * framing.radius * framing.to_light
+    fov, pixels = 2.0 * float(np.degrees(np.arctan(1.1 / 8.0))), _LAMP_PIXELS[framing.radius > 2.0]
+    return Pinhole.at(_triple(position), _triple(framing.center), (0.0, 1.0, 0.0), fov, pixels, pixels)
 
 
 def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
