@@ -64,7 +64,9 @@ def test_files_hold_what_cameras_of_both_kinds_see(scenes: Path, tmp_path: Path)
         np.testing.assert_allclose(read["depth"][seen], 1000.0 * view["depth"][scene][seen], atol=0.51)
         assert (read["depth"][~seen] == 0).all()
         np.testing.assert_array_equal(read["instance"] - 1, view["instance"][scene])
-        np.testing.assert_array_equal(np.where(seen, read["category"] - 1, 7), view["category"][scene])
+        np.testing.assert_array_equal(
+            np.where(seen, read["category"] - 1, batch.scene_type.num_assets), view["category"][scene]
+        )
         np.testing.assert_allclose(read["normals"] / 127.5 - 1.0, view["normals"][scene], atol=0.005)
         marked = [annotation for annotation in coco["annotations"] if annotation["image_id"] == image["id"]]
         assert {entry["slot"] for entry in marked} == set(np.unique(view["instance"][scene]).tolist()) - {-1}
