@@ -4,8 +4,8 @@
 
 Scenes come from the grammars. Images are 640 x 480, by the three-quarter camera of pictures: depth and instances, all
 images of sensors but the lit picture, and the lit picture. TinyRenderer makes a picture without shadows, depth and
-instances at once. Times are CPU milliseconds of one thread, the least of rounds in turn; bodies are made before the clock
-starts. The viewer holds 16 scenes.
+instances at once. Times are CPU milliseconds of one thread, the least of rounds in turn, without the making of bodies.
+The viewer holds 16 scenes.
 """
 
 from __future__ import annotations
