@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.arrays import Array, Index, ranges
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import FINITE, Checked, Count, InvalidInputError, Positive
 
 Triple = tuple[float, float, float]
 _CHUNK = 1 << 17
@@ -16,7 +17,7 @@ _CHUNK = 1 << 17
 
 
 @dataclass(frozen=True, eq=False)
-class Pinhole:
+class Pinhole(Checked):
     """A pinhole camera by intrinsics and pose, with the axes of OpenCV: x right, y down, z forward along the view.
 
     Attributes:
@@ -39,15 +40,17 @@ class Pinhole:
     """
 
     pose: Array
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
-    near: float = 0.01
+    fx: Positive
+    fy: Positive
+    cx: Annotated[float, FINITE]
+    cy: Annotated[float, FINITE]
+    width: Count
+    height: Count
+    near: Positive = 0.01
+    place = "a camera's "
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         pose = np.array(self.pose, dtype=np.float64)
         object.__setattr__(self, "pose", pose)
         turn = pose[:3, :3] if pose.shape == (4, 4) and np.isfinite(pose).all() else np.zeros((3, 3))
@@ -56,10 +59,6 @@ class Pinhole:
                 "the pose of a camera is a (4, 4) rigid motion of the columns right, down, forward, position, with the "
                 f"last row 0 0 0 1; got {pose.tolist()}"
             )
-        for name in ("fx", "fy", "cx", "cy", "width", "height", "near"):
-            if not (-np.inf if name in ("cx", "cy") else 0.0) < getattr(self, name) < np.inf:
-                wanted = "finite" if name in ("cx", "cy") else "above 0"
-                raise InvalidInputError(f"{name} of a camera must be {wanted}, got {name}={getattr(self, name)}")
 
     @classmethod
     def at(cls, position: Triple, target: Triple, up: Triple, fov_y: float, width: int, height: int) -> Pinhole:

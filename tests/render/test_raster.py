@@ -154,11 +154,11 @@ def test_a_camera_without_a_direction_is_refused():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"fx": 0.0}, "fx of a camera must be above 0, got fx=0.0"),
-        ({"fy": -3.0}, "fy of a camera must be above 0, got fy=-3.0"),
-        ({"near": 0.0}, "near of a camera must be above 0"),
-        ({"cx": np.nan}, "cx of a camera must be finite, got cx=nan"),
-        ({"width": 0}, "width of a camera must be above 0, got width=0"),
+        ({"fx": 0.0}, "a camera's fx=0.0 must be a positive number"),
+        ({"fy": -3.0}, "a camera's fy=-3.0 must be a positive number"),
+        ({"near": 0.0}, "a camera's near=0.0 must be a positive number"),
+        ({"cx": np.nan}, "a camera's cx=nan must be a finite number"),
+        ({"width": 0}, "a camera's width=0 must be at least 1"),
         ({"pose": np.eye(3)}, r"\(4, 4\) rigid motion"),
         ({"pose": np.diag([1.0, 1.0, -1.0, 1.0])}, "rigid motion"),
         ({"pose": np.diag([2.0, 2.0, 2.0, 1.0])}, "rigid motion"),

@@ -5,17 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from agents.cli.run_folder import Run
-from agents.configuration.composition import require_one_of
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Checked, Count, InvalidInputError, OneOf
 
 _MODES = ("rgb", "depth", "instance", "category", "normals", "semantic")
 
 
 @dataclass
-class RenderConfig:
+class RenderConfig(Checked):
     """Images of cameras in scenes, with annotations as those of COCO.
 
     Attributes:
@@ -29,20 +28,19 @@ class RenderConfig:
     """
 
     scenes: str = ""
-    count: int | None = 16
+    count: Count | None = 16
     modes: list[str] = field(default_factory=lambda: list(_MODES[:-1]))
     cameras: str = ""
-    depth: str = "png"
+    depth: Annotated[str, OneOf(("png", "npy"))] = "png"
     output: str = ""
 
 
 def check(settings: RenderConfig) -> None:
-    """Refuse settings that name no scenes, no images, or another file of depth."""
+    """Refuse settings that name no scenes or no images."""
     if not settings.scenes:
         raise InvalidInputError("render: name a scene file, run or dataset, as in scenes=runs/mine")
     if not settings.modes or not {*settings.modes} <= {*_MODES}:
         raise InvalidInputError(f"modes={settings.modes}: give some of {', '.join(_MODES)}")
-    require_one_of(settings, "depth", ("png", "npy"))
 
 
 def run(settings: RenderConfig, run: Run) -> None:
