@@ -125,6 +125,23 @@ def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, secon
     return (corners[first] * directions[second] + directions[first] * corners[second]).astype(np.float64)
 
 
+def may_meet(
+    library: LibraryGeometry, objects: Objects, first: Index, second: Index, way: Array, margin: float
+) -> Mask:
+    """(P,) whether coarse parts of the pairs of objects ``first`` (P,), ``second`` (P,) may come nearer than ``margin``
+    (m) on the straight ``way`` (n, 3) m of each object: no face plane keeps them apart from its start to its end.
+    """
+    used, local = np.unique(np.concatenate([first, second]), return_inverse=True)
+    placed = place(library, objects[used], "coarse")
+    pair, a, b = part_pairs(placed, local[: len(first)], local[len(first) :])
+    along = np.repeat(way[used], placed.count, axis=0)
+    low, high = placed.low + np.minimum(along, 0.0), placed.high + np.maximum(along, 0.0)
+    near = np.flatnonzero(_boxes_near(low, high, a, b, max(margin, 0.0)))
+    gap, direction = separations(library, placed.parts, a[near], b[near])
+    after = gap + (direction * (along[b] - along[a])[near]).sum(axis=1)
+    return np.bincount(pair[near], weights=np.minimum(gap, after) < margin, minlength=len(first)) > 0  # type: ignore[no-any-return]
+
+
 def _boxes_near(low: Array, high: Array, a: Index, b: Index, margin: float, fixed: Mask | None = None) -> Mask:
     height = margin if fixed is None else np.where(fixed, NEAR_FIXED, margin)
     near = (low[a, 0] <= high[b, 0] + margin) & (low[b, 0] <= high[a, 0] + margin)

@@ -10,12 +10,12 @@ from functools import cache
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.collision import Collider, scene_pairs
+from scene_envs.physics.collision import Collider, may_meet, scene_pairs
 from scene_envs.physics.engines import Course, Engine, Moved
 from scene_envs.physics.mujoco import MujocoEngine
 from scene_envs.physics.parts import GRAVITY, LibraryGeometry, library_geometry
 from scene_envs.physics.placement import Budget, ObjectPairs, Objects, components, object_boxes, place
-from scene_envs.physics.statics import Rest, Statics, Support, clusters, company
+from scene_envs.physics.statics import Rest, Statics, Support, clusters, company, upward
 from scene_envs.scene_types import SceneType
 
 _FAR, _MARGIN = 2e-3, 1e-3
@@ -110,7 +110,7 @@ def motion(
     rest = physics.rest(objects, pairs, duration)
     if tilt == (0.0, 0.0):
         way, units = physics.engine.fall(duration)
-        loose, struck = _falls(objects, pairs, rest, way)
+        loose, struck = _falls(physics.library, objects, pairs, rest, way)
         for scene in objects.scene[loose]:
             budgets[scene].spent += units
         rest = Rest((rest.still | loose) & ~struck, np.where(loose, -way, rest.rise), rest.tilt)
@@ -130,12 +130,13 @@ def motion(
     return displacement, rotation, np.array(lost, dtype=np.int64)
 
 
-def _falls(objects: Objects, pairs: ObjectPairs, rest: Rest, way: float) -> tuple[Mask, Mask]:
+def _falls(library: LibraryGeometry, objects: Objects, pairs: ObjectPairs, rest: Rest, way: float) -> tuple[Mask, Mask]:
     """(n,) objects of some scenes that fall freely by ``way`` (m) and meet nothing, and (n,) objects at rest onto which
     others fall.
     """
     falling = ~(rest.still | objects.fixed)
-    _spread(falling, pairs.first, pairs.second)
+    close = pairs.gap < _MARGIN
+    _spread(falling, pairs.first[close], pairs.second[close])
     loose, struck = falling.copy(), np.zeros(len(objects), dtype=bool)
     if not falling.any():
         return loose, struck
@@ -147,6 +148,8 @@ def _falls(objects: Objects, pairs: ObjectPairs, rest: Rest, way: float) -> tupl
     low = pairs.low - _MARGIN
     low[falling, 2] -= way
     met = ((low[first] <= pairs.high[second]) & (low[second] <= pairs.high[first])).all(axis=1)
+    first, second = first[met], second[met]
+    met = may_meet(library, objects, first, second, upward(np.where(falling, -way, 0.0)), _MARGIN)
     first, second = first[met], second[met]
     struck[first[~falling[first]]] = struck[second[~falling[second]]] = True
     _spread(loose, first, second)
@@ -260,7 +263,10 @@ def _meetings(
     meets = ((low[:, None] <= pairs.high[None]) & (pairs.low[None] <= high[:, None])).all(axis=2)
     apart = (group[movers][:, None] != group[None]) | (group[None] < 0)
     first, second = np.nonzero(meets & np.where(objects.fixed[None], left_out[movers], apart))
-    return movers[first], second
+    first, way = movers[first], moved.translation - objects.translation
+    met = (moved.angle * reach)[first] > _MARGIN  # others hardly turned
+    met |= may_meet(physics.library, objects, first, second, way, 2 * _MARGIN)
+    return first[met], second[met]
 
 
 def settle_scene(

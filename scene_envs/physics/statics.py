@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.collision import NEAR, scene_pairs
+from scene_envs.physics.collision import NEAR, may_meet, scene_pairs
 from scene_envs.physics.parts import (
     GRAVITY,
     AssetGeometry,
@@ -94,6 +94,7 @@ class Statics:
         self._library = library
         self._foot = _Polygons.of([_foot(asset) for asset in library.assets])
         self._surface = _Polygons.of([_surface(part.vertices) for part in library.parts])
+        self._under = _Polygons.of([_surface(part.vertices * (1.0, 1.0, -1.0)) for part in library.parts])
         for asset in library.assets:
             if asset.is_hollow:  # the coarse parts have tops where there is nothing to stand on
                 self._surface.offsets[asset.coarse.ids] = -np.inf
@@ -187,6 +188,30 @@ class Statics:
         at_rim &= offset <= self._bottom.corners[up] - self._top.hole[down]
         at_rim &= (hole == 0) | (offset <= self._top.corners[down] - hole)
         good[q] |= at_rim
+        q = np.flatnonzero(candidates & ~np.isin(upper, upper[good]))
+        own = np.where(
+            contacts.second[rows[q]] == upper[q], contacts.part_second[rows[q]], contacts.part_first[rows[q]]
+        )
+        good[q] = self._spans(objects, upper[q], lower[q], own, part[q], center)
+        return good
+
+    def _spans(self, objects: Objects, upper: Index, lower: Index, own: Index, part: Index, center: Array) -> Mask:
+        """(Q,) whether the ``center`` (n, 2) m of each ``upper`` object (Q,) is inside the convex hull of its contacts,
+        each of which is between its part ``own`` (Q,) and the ``part`` (Q,) of the object ``lower`` (Q,).
+        """
+        good = np.zeros(len(upper), dtype=bool)
+        feet = _out_of(objects, upper, self._under.corners[own])
+        tops = _out_of(objects, lower, self._surface.corners[part])
+        on_top = self._surface.outside(part, _into(objects, lower, feet)) < 0.0
+        on_top &= np.abs(self._under.height[own] + self._foot.height[objects.category[upper]])[:, None] < _FOOT
+        on_foot = self._under.outside(own, _into(objects, upper, tops)) < 0.0
+        points, met = np.concatenate([feet, tops], axis=1), np.concatenate([on_top, on_foot], axis=1)
+        for index in np.unique(upper):
+            rows = upper == index
+            outline = _outline(points[rows][met[rows]])
+            if outline is not None:
+                hull = _Polygons.of([(0.0, outline)])
+                good[rows] = hull.outside(np.zeros(1, dtype=np.int64), center[index][None, None])[0, 0] < -_BALANCE
         return good
 
     def _clear(
@@ -214,8 +239,15 @@ class Statics:
             keep &= (support[first] != second) & (support[second] != first)
             first, second = first[keep], second[keep]
             meets = ((low[first] <= high[second] + NEAR) & (low[second] <= high[first] + NEAR)).all(axis=1)
-            still[first[meets & falling[first]]] = False
-            still[second[meets & falling[second]]] = False
+            first, second = first[meets], second[meets]
+            met = may_meet(self._library, objects, first, second, upward(moved), -_TOUCHING)
+            still[first[met & falling[first]]] = False
+            still[second[met & falling[second]]] = False
+
+
+def upward(rise: Array) -> Array:
+    """(n, 3) m, ways straight up."""
+    return np.stack([0.0 * rise, 0.0 * rise, rise], axis=1)
 
 
 def _rises(support: Index, drop: Array, fixed: Mask) -> tuple[Array, Index]:
