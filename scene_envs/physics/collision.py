@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 
 import numpy as np
@@ -107,6 +107,25 @@ class Collider:
         pair, a, b = part_pairs(placed, local[: len(first)], local[len(first) :])
         return pairs.contacts[coarse] + self._near_parts(objects, placed, first, second, pair, a, b)[0]
 
+    def may_meet(
+        self, objects: Objects, pairs: ObjectPairs, first: Index, second: Index, way: Array, margin: float
+    ) -> tuple[Index, Index]:
+        """Those of some pairs of objects (P,), (P,) that may come nearer than ``margin`` (m) on the straight ``way``
+        (n, 3) m of each object: no face plane of their coarse parts keeps them apart from its start to its end.
+        """
+        ends = pairs.low + np.minimum(way, 0.0), pairs.high + np.maximum(way, 0.0)
+        near = _boxes_near(*ends, first, second, NEAR)
+        first, second = first[near], second[near]
+        used, local = np.unique(np.concatenate([first, second]), return_inverse=True)
+        placed = place(self.library, objects[used], "coarse")
+        along = np.repeat(way[used], placed.count, axis=0)
+        low, high = placed.low + np.minimum(along, 0.0), placed.high + np.maximum(along, 0.0)
+        pair, a, b = part_pairs(placed, local[: len(first)], local[len(first) :])
+        contacts, pair = self._near_parts(objects, replace(placed, low=low, high=high), first, second, pair, a, b)
+        change = (contacts.direction * (way[contacts.second] - way[contacts.first])).sum(axis=1)
+        met = np.unique(pair[contacts.gap + np.minimum(change, 0.0) < margin])
+        return first[met], second[met]
+
     def _near_parts(
         self, objects: Objects, placed: PlacedObjects, first: Index, second: Index, pair: Index, a: Index, b: Index
     ) -> tuple[Contacts, Index]:
@@ -123,23 +142,6 @@ def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, secon
     """(P,) work to test each pair: corners of one object's parts times face directions of the other's, both ways."""
     corners, directions = library.corners[objects.category], library.directions[objects.category]
     return (corners[first] * directions[second] + directions[first] * corners[second]).astype(np.float64)
-
-
-def may_meet(
-    library: LibraryGeometry, objects: Objects, first: Index, second: Index, way: Array, margin: float
-) -> Mask:
-    """(P,) whether coarse parts of the pairs of objects ``first`` (P,), ``second`` (P,) may come nearer than ``margin``
-    (m) on the straight ``way`` (n, 3) m of each object: no face plane keeps them apart from its start to its end.
-    """
-    used, local = np.unique(np.concatenate([first, second]), return_inverse=True)
-    placed = place(library, objects[used], "coarse")
-    pair, a, b = part_pairs(placed, local[: len(first)], local[len(first) :])
-    along = np.repeat(way[used], placed.count, axis=0)
-    low, high = placed.low + np.minimum(along, 0.0), placed.high + np.maximum(along, 0.0)
-    near = np.flatnonzero(_boxes_near(low, high, a, b, max(margin, 0.0)))
-    gap, direction = separations(library, placed.parts, a[near], b[near])
-    after = gap + (direction * (along[b] - along[a])[near]).sum(axis=1)
-    return np.bincount(pair[near], weights=np.minimum(gap, after) < margin, minlength=len(first)) > 0  # type: ignore[no-any-return]
 
 
 def _boxes_near(low: Array, high: Array, a: Index, b: Index, margin: float, fixed: Mask | None = None) -> Mask:

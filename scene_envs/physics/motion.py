@@ -10,12 +10,12 @@ from functools import cache
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.collision import Collider, may_meet, scene_pairs
+from scene_envs.physics.collision import Collider, scene_pairs
 from scene_envs.physics.engines import Course, Engine, Moved
 from scene_envs.physics.mujoco import MujocoEngine
 from scene_envs.physics.parts import GRAVITY, LibraryGeometry, library_geometry
 from scene_envs.physics.placement import Budget, ObjectPairs, Objects, components, object_boxes, place
-from scene_envs.physics.statics import Rest, Statics, Support, clusters, company, upward
+from scene_envs.physics.statics import Rest, Statics, Support, clusters, company
 from scene_envs.scene_types import SceneType
 
 _FAR, _MARGIN = 2e-3, 1e-3
@@ -54,7 +54,7 @@ class Physics:
         self.engine = make_engine(engine, library)
         self.collider = Collider(library)
         self.support = Support(library)
-        self.statics = Statics(library)
+        self.statics = Statics(self.collider)
         self._known: dict[bytes, tuple[Moved, float]] = {}
         self._lock = threading.Lock()
 
@@ -110,7 +110,7 @@ def motion(
     rest = physics.rest(objects, pairs, duration)
     if tilt == (0.0, 0.0):
         way, units = physics.engine.fall(duration)
-        loose, struck = _falls(physics.library, objects, pairs, rest, way)
+        loose, struck = _falls(physics.collider, objects, pairs, rest, way)
         for scene in objects.scene[loose]:
             budgets[scene].spent += units
         rest = Rest((rest.still | loose) & ~struck, np.where(loose, -way, rest.rise), rest.tilt)
@@ -130,7 +130,7 @@ def motion(
     return displacement, rotation, np.array(lost, dtype=np.int64)
 
 
-def _falls(library: LibraryGeometry, objects: Objects, pairs: ObjectPairs, rest: Rest, way: float) -> tuple[Mask, Mask]:
+def _falls(collider: Collider, objects: Objects, pairs: ObjectPairs, rest: Rest, way: float) -> tuple[Mask, Mask]:
     """(n,) objects of some scenes that fall freely by ``way`` (m) and meet nothing, and (n,) objects at rest onto which
     others fall.
     """
@@ -145,12 +145,7 @@ def _falls(library: LibraryGeometry, objects: Objects, pairs: ObjectPairs, rest:
     _spread(loose, pairs.first, pairs.second)
     first, second = scene_pairs(objects)
     first, second = (rows[falling[first] | falling[second]] for rows in (first, second))
-    low = pairs.low - _MARGIN
-    low[falling, 2] -= way
-    met = ((low[first] <= pairs.high[second]) & (low[second] <= pairs.high[first])).all(axis=1)
-    first, second = first[met], second[met]
-    met = may_meet(library, objects, first, second, upward(np.where(falling, -way, 0.0)), _MARGIN)
-    first, second = first[met], second[met]
+    first, second = collider.may_meet(objects, pairs, first, second, np.outer(falling, (0.0, 0.0, -way)), _MARGIN)
     struck[first[~falling[first]]] = struck[second[~falling[second]]] = True
     _spread(loose, first, second)
     return loose, struck & rest.still
@@ -264,9 +259,9 @@ def _meetings(
     apart = (group[movers][:, None] != group[None]) | (group[None] < 0)
     first, second = np.nonzero(meets & np.where(objects.fixed[None], left_out[movers], apart))
     first, way = movers[first], moved.translation - objects.translation
-    met = (moved.angle * reach)[first] > _MARGIN  # others hardly turned
-    met |= may_meet(physics.library, objects, first, second, way, 2 * _MARGIN)
-    return first[met], second[met]
+    turned = (moved.angle * reach)[first] > _MARGIN
+    met = physics.collider.may_meet(objects, pairs, first[~turned], second[~turned], way, 2 * _MARGIN)
+    return np.concatenate([first[turned], met[0]]), np.concatenate([second[turned], met[1]])
 
 
 def settle_scene(
