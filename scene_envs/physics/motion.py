@@ -135,14 +135,14 @@ def _falls(collider: Collider, objects: Objects, pairs: ObjectPairs, rest: Rest,
     others fall.
     """
     falling = ~(rest.still | objects.fixed)
-    close = pairs.gap < _MARGIN
-    _spread(falling, pairs.first[close], pairs.second[close])
+    close = [rows[pairs.gap < _MARGIN] for rows in (pairs.first, pairs.second)]
+    _spread(falling, *close)
     loose, struck = falling.copy(), np.zeros(len(objects), dtype=bool)
     if not falling.any():
         return loose, struck
     touching = pairs.depth > 0
     loose[pairs.first[touching]] = loose[pairs.second[touching]] = False
-    _spread(loose, pairs.first, pairs.second)
+    _spread(loose, *close)
     first, second = scene_pairs(objects)
     first, second = (rows[falling[first] | falling[second]] for rows in (first, second))
     first, second = collider.may_meet(objects, pairs, first, second, np.outer(falling, (0.0, 0.0, -way)), _MARGIN)
