@@ -92,7 +92,7 @@ def make_ready(
         raise InvalidInputError(f"rounds={rounds} must be at least 1: each projects and settles once")
     check_numbers(duration)
     pool = chosen_pool(pool, physics)
-    batch, furniture = _furniture_apart(batch.to("cpu"), pool)
+    batch, furniture = _furniture_apart(batch, pool)
     units = stack(run_kernel("units", batch, {}, pool), batch, "units", torch.float64, shape=())
     reserve = (1.0 - _ROUNDS_SHARE) * units
     units = units - reserve
