@@ -395,6 +395,7 @@ READING: dict[str, str] = {
     "feasible_objects": "free objects per scene that are neither deep in others nor move; higher is better",
     "feasible_fraction": "the same as a share of free objects; higher is better",
     "ready_invalid_fraction": "scenes that could not be made ready",
+    "ready_furniture_collision_rate": "rooms in which a table or shelf is still more than 1 mm in another",
     "ready_objects": "feasible objects per scene after projection and settling; higher is better",
     "ready_fraction": "the same as a share of free objects; higher is better",
     "stable_2s_invalid_fraction": "scenes that could not be simulated for 2 s",

@@ -72,6 +72,9 @@ def ready_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[st
 
     result = make_ready(batch, pool=pool)
     figures = {"ready_invalid_fraction": 1.0 - float(result.valid.double().mean())}
+    if batch.scene_type.furniture_categories:
+        collides = (result.furniture_depth > COLLISION).any(dim=1)
+        figures["ready_furniture_collision_rate"] = float(collides.double().mean())
     return {**figures, **per_scene_and_fraction("ready", batch, result.counts, result.valid)}
 
 

@@ -239,6 +239,7 @@ class ReadyResult:
         finished: (B,) bool; False where the scene's work budget was spent first: the batch is the best effort, and
             objects that were not judged are not ready. False also where ``valid`` is False.
         valid: (B,) bool; False where the first round could not judge the scene.
+        furniture_depth: (B, N) m, :func:`furniture_overlap` of ``batch``; no object is ready where it is above 1 mm.
     """
 
     batch: SceneBatch
@@ -246,6 +247,7 @@ class ReadyResult:
     counts: Tensor
     finished: Tensor
     valid: Tensor
+    furniture_depth: Tensor
 
 
 def check_numbers(duration: float, **limits: float) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 
 import numpy as np
@@ -106,6 +106,25 @@ class Collider:
         placed = place(self.library, objects[used], "fine")
         pair, a, b = part_pairs(placed, local[: len(first)], local[len(first) :])
         return pairs.contacts[coarse] + self._near_parts(objects, placed, first, second, pair, a, b)[0]
+
+    def may_meet(
+        self, objects: Objects, pairs: ObjectPairs, first: Index, second: Index, way: Array, margin: float
+    ) -> tuple[Index, Index]:
+        """Those of some pairs of objects (P,), (P,) that may come nearer than ``margin`` (m) on the straight ``way``
+        (n, 3) m of each object: no face plane of their coarse parts keeps them apart from its start to its end.
+        """
+        ends = pairs.low + np.minimum(way, 0.0), pairs.high + np.maximum(way, 0.0)
+        near = _boxes_near(*ends, first, second, NEAR)
+        first, second = first[near], second[near]
+        used, local = np.unique(np.concatenate([first, second]), return_inverse=True)
+        placed = place(self.library, objects[used], "coarse")
+        along = np.repeat(way[used], placed.count, axis=0)
+        low, high = placed.low + np.minimum(along, 0.0), placed.high + np.maximum(along, 0.0)
+        pair, a, b = part_pairs(placed, local[: len(first)], local[len(first) :])
+        contacts, pair = self._near_parts(objects, replace(placed, low=low, high=high), first, second, pair, a, b)
+        change = (contacts.direction * (way[contacts.second] - way[contacts.first])).sum(axis=1)
+        met = np.unique(pair[contacts.gap + np.minimum(change, 0.0) < margin])
+        return first[met], second[met]
 
     def _near_parts(
         self, objects: Objects, placed: PlacedObjects, first: Index, second: Index, pair: Index, a: Index, b: Index

@@ -54,7 +54,7 @@ class Physics:
         self.engine = make_engine(engine, library)
         self.collider = Collider(library)
         self.support = Support(library)
-        self.statics = Statics(library)
+        self.statics = Statics(self.collider)
         self._known: dict[bytes, tuple[Moved, float]] = {}
         self._lock = threading.Lock()
 
@@ -110,7 +110,7 @@ def motion(
     rest = physics.rest(objects, pairs, duration)
     if tilt == (0.0, 0.0):
         way, units = physics.engine.fall(duration)
-        loose, struck = _falls(objects, pairs, rest, way)
+        loose, struck = _falls(physics.collider, objects, pairs, rest, way)
         for scene in objects.scene[loose]:
             budgets[scene].spent += units
         rest = Rest((rest.still | loose) & ~struck, np.where(loose, -way, rest.rise), rest.tilt)
@@ -130,24 +130,22 @@ def motion(
     return displacement, rotation, np.array(lost, dtype=np.int64)
 
 
-def _falls(objects: Objects, pairs: ObjectPairs, rest: Rest, way: float) -> tuple[Mask, Mask]:
+def _falls(collider: Collider, objects: Objects, pairs: ObjectPairs, rest: Rest, way: float) -> tuple[Mask, Mask]:
     """(n,) objects of some scenes that fall freely by ``way`` (m) and meet nothing, and (n,) objects at rest onto which
     others fall.
     """
     falling = ~(rest.still | objects.fixed)
-    _spread(falling, pairs.first, pairs.second)
+    close = [rows[pairs.gap < _MARGIN] for rows in (pairs.first, pairs.second)]
+    _spread(falling, *close)
     loose, struck = falling.copy(), np.zeros(len(objects), dtype=bool)
     if not falling.any():
         return loose, struck
     touching = pairs.depth > 0
     loose[pairs.first[touching]] = loose[pairs.second[touching]] = False
-    _spread(loose, pairs.first, pairs.second)
+    _spread(loose, *close)
     first, second = scene_pairs(objects)
     first, second = (rows[falling[first] | falling[second]] for rows in (first, second))
-    low = pairs.low - _MARGIN
-    low[falling, 2] -= way
-    met = ((low[first] <= pairs.high[second]) & (low[second] <= pairs.high[first])).all(axis=1)
-    first, second = first[met], second[met]
+    first, second = collider.may_meet(objects, pairs, first, second, np.outer(falling, (0.0, 0.0, -way)), _MARGIN)
     struck[first[~falling[first]]] = struck[second[~falling[second]]] = True
     _spread(loose, first, second)
     return loose, struck & rest.still
@@ -260,7 +258,10 @@ def _meetings(
     meets = ((low[:, None] <= pairs.high[None]) & (pairs.low[None] <= high[:, None])).all(axis=2)
     apart = (group[movers][:, None] != group[None]) | (group[None] < 0)
     first, second = np.nonzero(meets & np.where(objects.fixed[None], left_out[movers], apart))
-    return movers[first], second
+    first, way = movers[first], moved.translation - objects.translation
+    turned = (moved.angle * reach)[first] > _MARGIN
+    met = physics.collider.may_meet(objects, pairs, first[~turned], second[~turned], way, 2 * _MARGIN)
+    return np.concatenate([first[turned], met[0]]), np.concatenate([second[turned], met[1]])
 
 
 def settle_scene(

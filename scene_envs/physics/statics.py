@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.collision import NEAR, scene_pairs
+from scene_envs.physics.collision import NEAR, Collider, scene_pairs
 from scene_envs.physics.parts import (
     GRAVITY,
     AssetGeometry,
@@ -90,10 +90,11 @@ class _Polygons:
 class Statics:
     """Closed-form test of rest, from precomputed feet and surfaces."""
 
-    def __init__(self, library: LibraryGeometry) -> None:
-        self._library = library
+    def __init__(self, collider: Collider) -> None:
+        self._collider, self._library = collider, (library := collider.library)
         self._foot = _Polygons.of([_foot(asset) for asset in library.assets])
         self._surface = _Polygons.of([_surface(part.vertices) for part in library.parts])
+        self._under = _Polygons.of([_surface(part.vertices * (1.0, 1.0, -1.0)) for part in library.parts])
         for asset in library.assets:
             if asset.is_hollow:  # the coarse parts have tops where there is nothing to stand on
                 self._surface.offsets[asset.coarse.ids] = -np.inf
@@ -166,7 +167,8 @@ class Statics:
         middle = center[upper][:, None]
         candidates = self._foot.outside(objects.category[upper], _into(objects, upper, middle))[:, 0] < -_BALANCE
         local = _into(objects, lower, middle)
-        part = np.where(contacts.second[rows] == upper, contacts.part_first[rows], contacts.part_second[rows])
+        parts, is_second = (contacts.part_first[rows], contacts.part_second[rows]), contacts.second[rows] == upper
+        part, own = np.where(is_second, *parts), np.where(is_second, *parts[::-1])
         inside = candidates & (self._surface.outside(part, local)[:, 0] < -_BALANCE)
         q = np.flatnonzero(inside)
         up = objects.category[upper[q]]
@@ -187,6 +189,19 @@ class Statics:
         at_rim &= offset <= self._bottom.corners[up] - self._top.hole[down]
         at_rim &= (hole == 0) | (offset <= self._top.corners[down] - hole)
         good[q] |= at_rim
+        # Or several parts carry it, whose contacts are all round the centre of mass.
+        q = np.flatnonzero(candidates & ~np.isin(upper, upper[good]))
+        feet = _out_of(objects, upper[q], self._under.corners[own[q]])
+        tops = _out_of(objects, lower[q], self._surface.corners[part[q]])
+        on_top = self._surface.outside(part[q], _into(objects, lower[q], feet)) < 0.0
+        on_foot = self._under.outside(own[q], _into(objects, upper[q], tops)) < 0.0
+        lowest = np.abs(self._under.height[own[q]] + self._foot.height[objects.category[upper[q]]]) < _FOOT
+        points, met = np.concatenate([feet, tops], axis=1), np.concatenate([on_top, on_foot], axis=1) & lowest[:, None]
+        for index in np.unique(upper[q]):
+            mine = upper[q] == index
+            if (outline := _outline(points[mine][met[mine]])) is not None:
+                hull = _Polygons.of([(0.0, outline)])
+                good[q[mine]] = hull.outside(np.array([0]), center[index][None, None])[0, 0] < -_BALANCE
         return good
 
     def _clear(
@@ -207,15 +222,12 @@ class Statics:
             still &= ~struck
         falling = still & (rise < -0.5 * NEAR)
         if falling.any():
-            low, high = pairs.low.copy(), pairs.high
-            low[falling, 2] += rise[falling]
             first, second = scene_pairs(objects)
             keep = (falling[first] | falling[second]) & ~(objects.fixed[first] | objects.fixed[second])
             keep &= (support[first] != second) & (support[second] != first)
-            first, second = first[keep], second[keep]
-            meets = ((low[first] <= high[second] + NEAR) & (low[second] <= high[first] + NEAR)).all(axis=1)
-            still[first[meets & falling[first]]] = False
-            still[second[meets & falling[second]]] = False
+            way = np.outer(moved, (0.0, 0.0, 1.0))
+            for met in self._collider.may_meet(objects, pairs, first[keep], second[keep], way, -_TOUCHING):
+                still[met[falling[met]]] = False
 
 
 def _rises(support: Index, drop: Array, fixed: Mask) -> tuple[Array, Index]:

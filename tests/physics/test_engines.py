@@ -78,7 +78,7 @@ def test_the_closed_form_of_falls_is_that_of_the_simulation(engine: str, monkeyp
     assert way == pytest.approx(0.5 * 9.81 * 0.01 * (1 + 1 / work), rel=1e-9)
     assert quick.displacement[:2][batch[:2].is_free].tolist() == pytest.approx([way] * 3, rel=1e-6)
     assert 0.019 < float(quick.displacement[2, 2]) < 0.03
-    monkeypatch.setattr(motion, "_falls", lambda objects, *_: np.zeros((2, len(objects)), dtype=bool))
+    monkeypatch.setattr(motion, "_falls", lambda _, objects, *rest: np.zeros((2, len(objects)), dtype=bool))
     slow = equilibrium(batch, physics=engine)
     torch.testing.assert_close(quick.displacement, slow.displacement, atol=1e-6, rtol=0)
     torch.testing.assert_close(quick.rotation, slow.rotation, atol=1e-6, rtol=0)

@@ -11,6 +11,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from agents.evaluation.physics_figures import ready_figures
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.physics import (
@@ -267,6 +268,35 @@ def test_furniture_overlaps_furniture_by_the_depth_of_the_boxes(overlap: float) 
     assert not furniture_overlap(boxes).any()  # where boxes are free, they are no furniture
     sunk = batch.translations - torch.tensor([0.0, 0.0, overlap]) * batch.is_furniture[..., None]
     assert furniture_overlap(batch.with_poses(sunk, batch.rotations))[0, 3].item() == pytest.approx(overlap, abs=1e-5)
+
+
+@pytest.mark.parametrize("overlap", [0.005, 0.03])
+def test_overlapping_furniture_is_moved_apart_or_its_scene_is_not_ready(
+    overlap: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two welded boxes in each other, each with a post on it; the boxes of a second scene are 1 cm apart."""
+    room = replace(TYPE, name="room_of_tables", welded=("floor", "cube"))
+    room.__dict__["library"] = TYPE.library
+    rows = [
+        scene(("cube", 0.0, 0.0, 0.0), ("cube", place, 0.0, 0.0), ("post", 0.0, 0.0, SIDE), ("post", place, 0.0, SIDE))
+        for place in (SIDE - overlap, SIDE + 0.01)
+    ]
+    batch = SceneBatch(torch.cat([row.tensor for row in rows]), room)
+    result = make_ready(batch)
+    assert result.counts.tolist() == [2, 2]
+    assert float(result.furniture_depth.max()) <= 1e-3
+    assert torch.equal(result.furniture_depth, furniture_overlap(result.batch))
+    way = (result.batch.translations - batch.translations)[..., 0]
+    assert way[0, 1:5].tolist() == pytest.approx(np.array([-1, 1, -1, 1]) * overlap / 2, abs=1e-3)
+    assert not way[1].any()
+    assert ready_figures(batch)["ready_furniture_collision_rate"] == 0.0
+    monkeypatch.setattr(
+        "scene_envs.physics.readiness.corrections", lambda batch, _: torch.zeros_like(batch.translations)
+    )
+    left = make_ready(batch)
+    assert left.counts.tolist() == [0, 2]
+    assert left.furniture_depth[0, 1:3].tolist() == pytest.approx([overlap, overlap], abs=1e-5)
+    assert ready_figures(batch)["ready_furniture_collision_rate"] == 0.5
 
 
 @pytest.mark.usefixtures("copied_workers")

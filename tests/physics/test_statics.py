@@ -82,6 +82,35 @@ def test_a_box_on_a_box_tips_when_its_centre_leaves_the_edge(
     assert bool(counts) is (shift > 0.045)
 
 
+@pytest.mark.parametrize(("shift", "rests"), [(0.006, True), (0.015, True), (0.03, True), (0.3, False)])
+def test_contacts_round_the_centre_of_mass_carry_a_bowl(
+    shift: float, rests: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bowl stands on the rim of another one, off its middle: 24 contacts of parts, none of which carries it alone.
+    Simulation with all parts says the same; 0.3 m aside it falls freely.
+    """
+    counts = simulations(monkeypatch)
+    batch = scene(("bowl", 0.0, 0.0, 0.0), ("bowl", shift, 0.0, 0.1))
+    result = feasibility(batch)
+    assert counts == []
+    assert bool(result.feasible[0, 2]) is rests
+    assert simulated(batch, monkeypatch).feasible.tolist() == result.feasible.tolist()
+
+
+def test_what_falls_close_by_others_falls_freely(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bowl falls past one that stands beside it, within its bounding box and 8 mm from its wall: g (dt^2) n (n+1)/2
+    in n = 48 steps; over its rim both are simulated.
+    """
+    counts = simulations(monkeypatch)
+    aside = 0.228 / np.sqrt(2.0)
+    result = feasibility(scene(("bowl", 0.0, 0.0, 0.0), ("bowl", aside, aside, 0.08)), physics="bullet")
+    assert counts == []
+    assert float(result.displacement[0, 2]) == pytest.approx(9.81 / 480**2 * 48 * 49 / 2, abs=1e-5)
+    assert bool(result.feasible[0, 1])
+    assert not bool(feasibility(scene(("bowl", 0.0, 0.0, 0.0), ("bowl", 0.15, 0.0, 0.12))).feasible[0, 2])
+    assert max(counts) == 2
+
+
 def test_what_is_carried_shifts_the_balance() -> None:
     """A post stands on a box that overhangs by 40 mm; two boxes on its far side tip it."""
     overhang = [("cube", 0.0, 0.0, 0.0), ("cube", 0.04, 0.0, SIDE)]
