@@ -65,6 +65,21 @@ class Placed:
         fixed = shapes.static[category] | constant_on(welded_mask(scene_type), points.device)[category]
         return shapes, cls(categories.shape, scene, slot, category, rotation, translation, center, points, feet, fixed)
 
+    def padded(self, values: Tensor, blank: float = 0) -> Tensor:
+        """``values`` (n, ...) of the objects in their slots, (B, N, ...); others hold ``blank``, or -1 of integers."""
+        blank = -1 if values.dtype == torch.int64 else blank
+        return values.new_full((*self.shape, *values.shape[1:]), blank).index_put((self.scene, self.slot), values)
+
+    def carried(self, support: Tensor) -> Tensor:
+        """(B, N, N) bool: [i, j] whether object j is i, or is held by i, directly or not; ``support`` (n,) are slots."""
+        carried = torch.eye(self.shape[1], dtype=torch.bool, device=support.device).repeat(self.shape[0], 1, 1)
+        scene, upper, lower, below = self.scene, self.slot, support, self.padded(support)
+        while len(held := torch.nonzero(lower >= 0)[:, 0]):
+            scene, upper, lower = scene[held], upper[held], lower[held]
+            carried[scene, lower, upper] = True
+            lower = below[scene, lower]
+        return carried
+
 
 @dataclass(frozen=True, eq=False)
 class Holding(Generic[Column]):
@@ -80,15 +95,6 @@ class Holding(Generic[Column]):
         """The same with other indices: those of the objects are ``numbers`` (n,), such as their slots."""
         numbers = torch.cat([numbers, numbers.new_full((1,), -1)])  # index -1 stays
         return Holding(numbers[self.support], self.contained, numbers[self.inside], numbers[self.place], self.tier)
-
-    def carries(self: Holding[Tensor]) -> Tensor:
-        """(n, n) bool: whether each object carries each other one, directly or through others."""
-        found = torch.zeros(len(self.support), len(self.support), dtype=torch.bool, device=self.support.device)
-        below, upper = self.support, torch.arange(len(self.support), device=self.support.device)
-        while len(upper := upper[below[upper] >= 0]):
-            found[below[upper], upper] = True
-            below = torch.where(below >= 0, self.support[below], -1)
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,12 +181,9 @@ class Contacts:
 def _near_pairs(objects: Placed) -> tuple[Tensor, Tensor]:
     """(upper, lower): pairs of one scene whose boxes allow that the first rests on or in the second."""
 
-    def padded(values: Tensor, blank: float) -> Tensor:
-        table = values.new_full((*objects.shape, *values.shape[1:]), blank)
-        return table.index_put((objects.scene, objects.slot), values)
-
+    padded = objects.padded
     low, high = (padded(side, torch.nan) for side in (objects.points.amin(dim=-1), objects.points.amax(dim=-1)))
-    fixed, upright = padded(objects.fixed, 0), padded(objects.rotation[:, 2, 2], 0.0) > _UPRIGHT
+    fixed, upright = padded(objects.fixed), padded(objects.rotation[:, 2, 2]) > _UPRIGHT
     a, b, top_a, top_b = low[:, :, None], low[:, None], high[:, :, None], high[:, None]
     near = (a[..., 2] <= top_b[..., 2] + _FAR * LARGEST_CONTACT) & (top_a[..., 2] > b[..., 2]) & upright[:, None]
     below = a[..., 2] > b[..., 2] + 1e-4  # so that no chain is a circle
@@ -188,5 +191,5 @@ def _near_pairs(objects: Placed) -> tuple[Tensor, Tensor]:
     for axis in (0, 1):
         near &= (a[..., axis] <= top_b[..., axis]) & (b[..., axis] <= top_a[..., axis])
     scene, first, second = torch.nonzero(near, as_tuple=True)
-    number = padded(torch.arange(len(objects.scene), device=near.device), -1)
+    number = padded(torch.arange(len(objects.scene), device=near.device))
     return number[scene, first], number[scene, second]

@@ -27,10 +27,8 @@ from scene_envs.supports import CONTACT, LARGEST_CONTACT, Contacts, Holding, Pla
 
 _FINEST = 0.02
 """Error (m) of positions below which nothing is moved: the denoising that is left separates objects again."""
-_SHALLOW = 0.02
-"""Depth (m) of a plate, up to which objects stand on the middle of an object and not on its rim."""
-_UPRIGHT = 0.85
-"""Cosine of the tilt up to which an object carries others on its upper side."""
+_SHALLOW, _UPRIGHT = 0.02, 0.85
+"""Depth (m) of a plate up to which objects stand on its middle, not on its rim; least cosine of its tilt."""
 
 
 class ClaimGuidance:
@@ -71,12 +69,8 @@ class ClaimGuidance:
         return (constant_on(self._axes, std.device).square() @ std.double().square()).sqrt()
 
     def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch], std: Tensor) -> Tensor:
-        """(B, N, 3) m, how far the denoised positions move.
-
-        Args:
-            step, steps: step and number of steps, which are not used.
-            denoised: function that gives the B scenes that the network expects.
-            std: (3,) standard deviation of their positions along the axes of the world, m, on their device.
+        """(B, N, 3) m, how far the positions of the scenes ``denoised()`` move; their standard deviation along the axes
+        of the world is ``std`` (3,), m. ``step`` and ``steps`` are not used.
         """
         batch, error, axes = denoised(), self._error(std), constant_on(self._axes, std.device)
         claims = [constant_on(table, std.device) for table in self._claims]
@@ -87,20 +81,21 @@ class ClaimGuidance:
         )
         return (self._moves(constraints(claims, scenes, error), scenes, error, free) @ axes).to(batch.tensor)
 
-    def _moves(self, wanted: Constraint, scenes: Scenes, error: Tensor, free: Tensor) -> Tensor:
+    def _moves(self, wanted: Tensor, scenes: Scenes, error: Tensor, free: Tensor) -> Tensor:
         """(B, N, 3) m, in the frame of ``scenes``: the sum of the moves for K constraints on objects that are free."""
-        slots, axis = scenes.names.shape[1], wanted.axis
-        scene, first, second = wanted.first // slots, wanted.first % slots, wanted.second % slots
+        slots, axis, (low, high, stays) = scenes.names.shape[1], wanted[:, 2:5], wanted[:, 5:].unbind(1)
+        pair = wanted[:, :2].long()
+        scene, (first, second) = pair[:, 0] // slots, (pair % slots).unbind(1)
         movers = []  # (K, N) each: what moves with an object, without the other one and what is on it
         for who, other in ((first, second), (second, first)):
             without = scenes.carried[scene, other] & scenes.carried[scene, who, other][:, None]
             movers.append(scenes.carried[scene, who] & ~without & free[scene])
         moved = torch.stack([who.any(dim=1) for who in movers])  # (2, K)
         uncertain = moved.sum(dim=0)
-        moved[1] &= ~wanted.second_stays
+        moved[1] &= stays == 0
         spread = uncertain.clamp(min=1).sqrt() * (axis * error).norm(dim=1)
-        offset = (axis * (_at(scenes.positions, wanted.first) - _at(scenes.positions, wanted.second))).sum(dim=1)
-        slope = probability_slope(offset, wanted.low, wanted.high, spread)
+        offset = (axis * (scenes.positions[scene, first] - scenes.positions[scene, second])).sum(dim=1)
+        slope = probability_slope(offset, low, high, spread)
         steps = (self.strength * uncertain / moved.sum(dim=0).clamp(min=1) * slope)[:, None] * error.square() * axis
         signs = (movers[0] & moved[0][:, None]).double() - (movers[1] & moved[1][:, None]).double()
         return torch.zeros_like(scenes.positions).index_add(0, scene, signs[..., None] * steps[:, None])
@@ -132,32 +127,23 @@ def probability_slope(value: Tensor, low: Tensor, high: Tensor, spread: Tensor) 
 
 
 class Scenes(NamedTuple):
-    """Objects of B scenes in N slots, at their expected places; m, along the axes right, front and up.
+    """Objects of B scenes in N slots, at their expected places; m, along the axes right, front and up."""
 
-    Attributes:
-        names: (B, N) number of the display name; -1 for an empty slot.
-        positions, low, high: (B, N, 3) centres of mass, and corners of bounding boxes.
-        fixed: (B, N) bool, welded objects.
-        levels: (B, N, L) heights of the tiers above the position, from the top; NaN for none.
-        top: (B, N) height above the position of the upper side at the middle, or of the rim of a hollow object.
-        held: supports by slots, (B, N) each.
-        carried: (B, N, N) bool: [i, j] whether object j is i, or is held by i, directly or through others.
-    """
-
-    names: Tensor
-    positions: Tensor
-    low: Tensor
-    high: Tensor
-    fixed: Tensor
-    levels: Tensor
-    top: Tensor
-    held: Holding[Tensor]
-    carried: Tensor
+    names: Tensor  # (B, N) number of the display name; -1 for an empty slot
+    positions: Tensor  # (B, N, 3) centres of mass
+    low: Tensor  # (B, N, 3) lowest corners of bounding boxes
+    high: Tensor  # (B, N, 3) highest corners
+    sizes: Tensor  # (B, N, 3) extents
+    foot: Tensor  # (B, N) height of each position above the object's lowest point
+    fixed: Tensor  # (B, N) bool, welded objects
+    levels: Tensor  # (B, N, L) heights of the tiers above the position, from the top; NaN for none
+    top: Tensor  # (B, N) height above the position of the upper side at the middle, or of the rim of a hollow object
+    held: Holding[Tensor]  # (B, N) each, supports by slots
+    carried: Tensor  # (B, N, N) bool: [i, j] whether object j is i, or is held by i, directly or through others
 
     @classmethod
     def of(cls, batch: SceneBatch, axes: Tensor, contact: Tensor) -> Scenes:
         """The scenes of ``batch`` along ``axes`` (3, 3), whose surfaces touch within ``contact`` (), m."""
-        shape, library = batch.categories.shape, batch.scene_type.library
         shapes, placed = Placed.of_scenes(batch.scene_type, batch.categories, batch.translations, batch.rotations)
         loose = Contacts.of(shapes, placed).holding(contact).counted(placed.slot)
         points, center = axes @ placed.points, placed.center @ axes.T
@@ -166,31 +152,11 @@ class Scenes(NamedTuple):
         middle = origin + shapes.top[shapes.cells(placed.category, torch.zeros_like(center))]
         flat = (placed.rotation[:, 2, 2] > _UPRIGHT) & (middle > highest - _SHALLOW)  # not hollow: no rim carries
         top, levels = torch.where(flat, middle, highest), shapes.tiers[placed.category] + origin[:, None]
-
-        def padded(values: Tensor) -> Tensor:
-            blank = -1 if values.dtype == torch.int64 else 0
-            return values.new_full((*shape, *values.shape[1:]), blank).index_put((placed.scene, placed.slot), values)
-
-        held = Holding(**{name: padded(column) for name, column in vars(loose).items()})
-        carried = torch.eye(shape[1], dtype=torch.bool, device=center.device).repeat(shape[0], 1, 1)
-        scene, upper, lower = placed.scene, placed.slot, loose.support
-        while len(standing := torch.nonzero(lower >= 0)[:, 0]):
-            scene, upper, lower = scene[standing], upper[standing], lower[standing]
-            carried[scene, lower, upper] = True
-            lower = held.support[scene, lower]
-        names = constant_on(names_of(library)[1], center.device)[placed.category]
-        columns = [padded(column) for column in (names, center, low, high, placed.fixed, levels, top)]
-        return cls._make([*columns, held, carried])
-
-    @property
-    def sizes(self) -> Tensor:
-        """(B, N, 3) extent of each object."""
-        return self.high - self.low
-
-    @property
-    def foot(self) -> Tensor:
-        """(B, N) height of each position above the object's lowest point."""
-        return self.positions[..., 2] - self.low[..., 2]
+        corners = low, high, high - low, center[:, 2] - low[:, 2]
+        names = constant_on(names_of(batch.scene_type.library)[1], center.device)[placed.category]
+        columns = [placed.padded(column) for column in (names, center, *corners, placed.fixed, levels, top)]
+        held = Holding(**{name: placed.padded(column) for name, column in vars(loose).items()})
+        return cls._make([*columns, held, placed.carried(loose.support)])
 
     def distances(self, rows: Tensor) -> Tensor:
         """(M, N, N) horizontal distances in the scenes ``rows`` (M,)."""
@@ -254,9 +220,9 @@ def claim_tables(claims: Sequence[Sequence[Claim]], scene_type: SceneType) -> li
                 both = *refer(claim.subject), *refer(claim.landmark)
                 tables[0].append([scene, _EDGES.index(claim.side), stays[0] and not stays[1], *both])
             elif isinstance(claim, PairCount | SupportCount):
-                pair = isinstance(claim, PairCount)
-                below = refer(Reference(claim.under) if isinstance(claim, PairCount) else claim.landmark)
-                tables[1].append([scene, *refer(Reference(claim.name))[:1], claim.number, claim.inside, pair, *below])
+                below = Reference(claim.under) if isinstance(claim, PairCount) else claim.landmark
+                told = claim.number, claim.inside, isinstance(claim, PairCount), *refer(below)
+                tables[1].append([scene, *refer(Reference(claim.name))[:1], *told])
             elif isinstance(claim, PlaceCount):
                 tables[2].append([scene, *refer(Reference(claim.name))[:1], claim.number, *at(claim.place)])
     return [torch.tensor(table, dtype=torch.int64) for table in tables]
@@ -267,75 +233,48 @@ def claim_tables(claims: Sequence[Sequence[Claim]], scene_type: SceneType) -> li
 
 _OFFSET, _CONE = 0.035, 1.3
 """Least offset (m) to a side, and its ratio to the offset across: the claim holds from 0.02 m and 1 on."""
-_BESIDE = 0.02
-"""Distance (m) of objects that are next to each other; the claim holds up to 0.05 m."""
-_ORDER = 0.02
-"""Least distance (m) between neighbours in an order."""
-_NEAR = 0.35
-"""Largest centre distance, as a share of the lower object's width, at which the upper may stand on it."""
+_BESIDE, _ORDER = 0.02, 0.02
+"""Distance (m) of objects that are next to each other (the claim holds up to 0.05 m); least one in an order."""
+_NEAR, _STOREY = 0.35, 0.2
+"""Largest centre distance, as a share of the lower width, and height (m), at which an object may stand on another."""
 _SHARP = 0.1
 """Error (m) of positions below which single supports are distinguished."""
-_STOREY = 0.2
-"""Largest difference of the heights (m) of two objects that may stand on each other."""
 _LATER = 1e6
 """Added to what others are to come before."""
-
-
-class Constraint(NamedTuple):
-    """K times ``low <= axis . (position of first - position of second) <= high``, in the frame of :class:`Scenes`.
-
-    Attributes:
-        first, second: (K,) the two objects, as scene * N + slot.
-        axis: (K, 3) unit vectors.
-        low, high: (K,) bounds in m; infinite for none.
-        second_stays: (K,) bool, whether the first object alone may be moved.
-    """
-
-    first: Tensor
-    second: Tensor
-    axis: Tensor
-    low: Tensor
-    high: Tensor
-    second_stays: Tensor
 
 
 def _bound(
     first: Tensor, second: Tensor, axis: Tensor, only: Tensor, low: float | Tensor, high: float | Tensor = math.inf,
     stays: bool = False,
-) -> Constraint:  # fmt: skip
-    """Constraints on K pairs of objects along A axes (A, 3) or (K, A, 3) of each, with bounds where ``only`` (K, A)."""
-    first, second = (index[:, None].expand_as(only).flatten() for index in (first, second))
-    zero, stay = torch.zeros_like(only, dtype=torch.float64), torch.full_like(only, stays).flatten()
-    least, most = torch.where(only, zero + low, -math.inf), torch.where(only, zero + high, math.inf)
-    return Constraint(first, second, axis.expand(*only.shape, 3).flatten(0, 1), least.flatten(), most.flatten(), stay)
+) -> Tensor:  # fmt: skip
+    """(K * A, 8) constraints ``low <= axis . (position of first - position of second) <= high`` on K pairs.
 
-
-def constraints(claims: Sequence[Tensor], scenes: Scenes, error: Tensor) -> Constraint:
-    """Constraints under which claims hold, with as few changes of supports and orders as possible.
-
-    Claims whose objects are not in the scene (yet) have none.
-
-    Args:
-        claims: tables of claims (:func:`claim_tables`), on the device of the scenes.
-        scenes: objects at their expected places.
-        error: (3,) standard deviation of the positions, m.
+    A row holds both objects, as scene * N + slot, the axis, both bounds (m), and whether the first object alone may be
+    moved. Axes are (A, 3) for all pairs or (K, A, 3). Bounds are infinite where ``only`` (K, A) is False.
     """
-    none = claims[0].new_zeros(0)
-    found = [_bound(none, none, _axes(error), none.bool()[:, None].expand(-1, 3), 0.0)]  # in a batch without claims
+    zero = torch.zeros_like(only, dtype=torch.float64)
+    least, most = torch.where(only, zero + low, -math.inf), torch.where(only, zero + high, math.inf)
+    pair = zero + first[:, None], zero + second[:, None]
+    row = torch.stack([*pair, *axis.expand(*only.shape, 3).unbind(-1), least, most, zero + stays], dim=-1)
+    return row.flatten(0, 1)
+
+
+def constraints(claims: Sequence[Tensor], scenes: Scenes, error: Tensor) -> Tensor:
+    """Constraints (K, 8) under which claims (:func:`claim_tables`) hold, with as few changes of supports and orders as
+    possible at the deviation ``error`` (3,) of positions. Claims whose objects are not in the scene (yet) have none.
+    """
+    found = [error.new_zeros(0, 8)]
     for table, constrain in zip(claims, (_sides, _supports, _places), strict=True):
         found += constrain(scenes, table, error[:2].max() < _SHARP) if len(table) else []
-    every = Constraint(*map(torch.cat, zip(*found, strict=True)))
-    known = torch.nonzero(torch.isfinite(every.low) | torch.isfinite(every.high))[:, 0]
-    return Constraint(*(column[known] for column in every))
+    every = torch.cat(found)
+    return every[torch.nonzero(torch.isfinite(every[:, 5:7]).any(dim=1))[:, 0]]
 
 
 def _ordered(
     scenes: Scenes, rows: Tensor, members: Tensor, ordinal: Tensor, edge: Tensor, taken: Tensor | None = None
-) -> tuple[Tensor, list[Constraint]]:
-    """Slot (M,) of the one of ``members`` (M, N) that is meant (-1: none), and constraints that keep its rank.
-
-    ``taken`` (M,) is the other object of the claim. Where both references mean the same object, its neighbour in the
-    order is taken instead.
+) -> tuple[Tensor, list[Tensor]]:
+    """Slot (M,) of the one of ``members`` (M, N) that is meant (-1: none), and constraints that keep its rank. If
+    it is the other object of the claim, ``taken`` (M,), its neighbour in the order is taken instead.
     """
     axis, slots = constant_on(_DIRECTIONS, rows.device)[edge][:, None], members.shape[1]
     along = (scenes.positions[rows] * axis).sum(dim=-1)
@@ -369,11 +308,9 @@ def _holds(scenes: Scenes, rows: Tensor, unit: Tensor, tier: Tensor) -> Tensor:
 
 def _refer(
     scenes: Scenes, rows: Tensor, told: Tensor, sharp: Tensor, taken: Tensor | None = None
-) -> tuple[Tensor, list[Constraint]]:
-    """Slot (M,) of the objects referred to in ``told`` (M, 7) (-1: none), and constraints that make this unambiguous.
-
-    Objects that are counted at a place move there as far as the reference needs them. ``taken`` is as for
-    :func:`_ordered`.
+) -> tuple[Tensor, list[Tensor]]:
+    """Slot (M,) of the objects referred to in ``told`` (M, 7) (-1: none), and constraints that make this unambiguous:
+    objects that are counted at a place move there as far as the reference needs them. ``taken``: see :func:`_ordered`.
     """
     names, (name, ordinal, edge, unit_name, unit_ordinal, unit_edge, tier) = scenes.names[rows], told.unbind(1)
     members, placed = names == name[:, None], unit_name != _NOWHERE
@@ -387,7 +324,7 @@ def _refer(
     return chosen, found + order
 
 
-def _sides(scenes: Scenes, table: Tensor, sharp: Tensor) -> list[Constraint]:
+def _sides(scenes: Scenes, table: Tensor, sharp: Tensor) -> list[Tensor]:
     """Constraints of claims on two objects; both come to the furniture and tier of one of them."""
     rows, side, swapped = table[:, :3].unbind(1)
     start, held = rows * scenes.names.shape[1], scenes.held
@@ -414,7 +351,7 @@ def _sides(scenes: Scenes, table: Tensor, sharp: Tensor) -> list[Constraint]:
     ]  # fmt: skip
 
 
-def _supports(scenes: Scenes, table: Tensor, sharp: Tensor) -> list[Constraint]:
+def _supports(scenes: Scenes, table: Tensor, sharp: Tensor) -> list[Tensor]:
     """Constraints of claims on a number of objects on or in one object, or each on or in one of a name."""
     rows, name, number, inside, pair, under_name = table[:, :6].unbind(1)
     names, inside, pair = scenes.names[rows], inside.bool()[:, None], pair.bool()[:, None]
@@ -452,19 +389,17 @@ def _supports(scenes: Scenes, table: Tensor, sharp: Tensor) -> list[Constraint]:
         holder[short] = torch.where(under >= 0, under, holder[short])
         kept[short] |= under >= 0
     claim, upper = torch.nonzero(kept, as_tuple=True)
-    found += _stand_on(scenes, start[claim] + upper, start[claim] + holder[claim, upper], inside[claim, 0])
+    found.append(_stand_on(scenes, start[claim] + upper, start[claim] + holder[claim, upper], inside[claim, 0]))
     claim, upper = torch.nonzero(removed, as_tuple=True)
-    return found + (_stand_beside(scenes, rows[claim], upper, holder[claim, upper]) if len(claim) else [])
+    return [*found, _stand_beside(scenes, rows[claim], upper, holder[claim, upper])] if len(claim) else found
 
 
 def _closest_pairs(apart: Tensor, wider: Tensor, alone: Tensor, number: Tensor) -> Tensor:
     """(M, N) the object under each object, -1 for none, in ``number`` (M,) pairs, the closest ones first.
 
-    Every object stands on one other at most, and where ``alone`` (M, 1), it carries one at most.
-
-    Args:
-        apart: (M, N, N) distance of an upper and a lower object, m; inf for pairs that may not be.
-        wider: (M, N, N) m, by how much the upper one is wider: of two orders of a pair the wider object is below.
+    Pairs of an upper and a lower object are ``apart`` (M, N, N), m, or inf if they may not be. The upper one is
+    ``wider`` (M, N, N), m; of two orders of a pair the wider object is below. Every object stands on one other at
+    most, and where ``alone`` (M, 1), it carries one at most.
     """
     slots = apart.shape[1]
     claim, numbers = (torch.arange(size, device=apart.device) for size in apart.shape[:2])
@@ -473,11 +408,10 @@ def _closest_pairs(apart: Tensor, wider: Tensor, alone: Tensor, number: Tensor) 
     for done in range(slots):
         least = apart.flatten(1).amin(dim=1)
         going = torch.nonzero((least < torch.inf) & (number > done))[:, 0]
+        state = (claim, apart, wider, alone, number, over, least)
+        claim, apart, wider, alone, number, over, least = (column[going] for column in state)
         if not len(going):
             break
-        claim, apart, wider, alone, number, over, least = (
-            column[going] for column in (claim, apart, wider, alone, number, over, least)
-        )
         best = torch.where(apart == least[:, None, None], wider, torch.inf).flatten(1).argmin(dim=1)
         row, upper, lower = torch.arange(len(claim), device=claim.device), best // slots, best % slots
         under[claim, upper] = lower
@@ -487,7 +421,7 @@ def _closest_pairs(apart: Tensor, wider: Tensor, alone: Tensor, number: Tensor) 
     return under
 
 
-def _places(scenes: Scenes, table: Tensor, sharp: Tensor) -> list[Constraint]:
+def _places(scenes: Scenes, table: Tensor, sharp: Tensor) -> list[Tensor]:
     """Constraints of claims on a number of objects at a place."""
     rows, name, number, unit_name, ordinal, edge, tier = table.unbind(1)
     names, slots, whole = scenes.names[rows], scenes.names.shape[1], (tier == _WHOLE)[:, None]
@@ -527,25 +461,16 @@ def _first(some: Tensor, key: Tensor, number: Tensor) -> Tensor:
     return some & (rank < number[:, None])
 
 
-# -- constraints on pairs -------------------------------------------------------------------------
-
-
 _AXES = torch.eye(3, dtype=torch.float64)
 """Right, front and up, the axes of positions."""
-_UPON = 0.15
-"""Share of an object's width within which the centre of what stands on it lies, to each side of its own centre."""
-_WITHIN = 0.25
-"""The same share for objects in a container."""
-_LEVEL = 0.004
-"""Largest difference of the heights of two objects in contact (m)."""
+_UPON, _WITHIN = 0.15, 0.25
+"""Share of an object's width within which the centre of what stands on it, or in it, lies to each side of its own."""
+_LEVEL, _REST = 0.004, 0.01
+"""Largest difference (m) of the heights of two objects in contact; height (m) above a tier of objects on it."""
 _FLOOR, _FILL = 0.01, 0.03
 """Thickness (m) of the bottom of a container; height (m) above it within which the lowest objects lie."""
-_REST = 0.01
-"""Height (m) above a tier within which objects on it stand."""
-_CLEAR = 1.1
-"""Distance of objects that no longer stand on each other, over their mean width."""
-_SPOT = 0.03
-"""Distance (m) from the chosen place within which such an object comes."""
+_CLEAR, _SPOT = 1.1, 0.03
+"""Distance, over their mean width, of objects that no longer stand on each other, and how far (m) it may be missed."""
 _OFF = 10.0
 """A place outside the furniture counts as less roomy by this factor times its distance."""
 _ROUND = torch.arange(16, dtype=torch.float64) * math.pi / 8
@@ -557,22 +482,25 @@ def _axes(like: Tensor) -> Tensor:
     return constant_on(_AXES, like.device)
 
 
-def _stand_on(scenes: Scenes, upper: Tensor, lower: Tensor, inside: Tensor) -> list[Constraint]:
+def _stand_on(scenes: Scenes, upper: Tensor, lower: Tensor, inside: Tensor) -> Tensor:
     """Constraints under which the objects ``upper`` (K,) stand on ``lower`` (K,), or lie in them."""
     reach = torch.where(inside, _WITHIN, _UPON)[:, None] * _at(scenes.sizes, lower)[:, :2]
     surface = torch.where(inside, _FLOOR - _at(scenes.foot, lower), _at(scenes.top, lower))
     height = (surface + _at(scenes.foot, upper))[:, None]
     most = height + _LEVEL + torch.where(inside, _FILL, 0.0)[:, None]
     low, high = torch.cat([-reach, height - _LEVEL], dim=1), torch.cat([reach, most], dim=1)
-    return [_bound(upper, lower, _axes(low), torch.ones_like(low, dtype=torch.bool), low, high)]
+    return _bound(upper, lower, _axes(low), torch.ones_like(low, dtype=torch.bool), low, high)
 
 
-def _stand_beside(scenes: Scenes, scene: Tensor, upper: Tensor, lower: Tensor) -> list[Constraint]:
+def _stand_beside(scenes: Scenes, scene: Tensor, upper: Tensor, lower: Tensor) -> Tensor:
     """Constraints that move the objects ``upper`` (K,) of scenes from ``lower`` (K,) to the place next to it that is,
     on the same furniture, farthest from all other objects.
     """
-    slots, support = scenes.names.shape[1], scenes.held.support
-    numbers = torch.arange(slots, device=scene.device)
+    slots, support, numbers = (
+        scenes.names.shape[1],
+        scenes.held.support,
+        torch.arange(scenes.names.shape[1], device=scene.device),
+    )
     loose = (support >= 0) & ~scenes.fixed.gather(1, support.clamp(min=0))
     below = torch.where(loose, support, numbers)
     for _ in range(slots.bit_length()):
@@ -591,10 +519,10 @@ def _stand_beside(scenes: Scenes, scene: Tensor, upper: Tensor, lower: Tensor) -
     goal = torch.cat([places.gather(1, best[:, None, None].expand(-1, 1, 2))[:, 0], height[:, None]], dim=1) - middle
     slack = torch.where(_axes(goal)[2] > 0, _LEVEL, _SPOT)
     pair, only = (scene * slots + upper, scene * slots + lower), torch.ones_like(goal, dtype=torch.bool)
-    return [_bound(*pair, _axes(goal), only, goal - slack, goal + slack, stays=True)]
+    return _bound(*pair, _axes(goal), only, goal - slack, goal + slack, stays=True)
 
 
-def _stand_at(scenes: Scenes, index: Tensor, unit: Tensor, level: Tensor, only: Tensor) -> Constraint:
+def _stand_at(scenes: Scenes, index: Tensor, unit: Tensor, level: Tensor, only: Tensor) -> Tensor:
     """Constraints that put objects (K,) in the outline of furniture ``unit`` (K,), ``level`` (K,) above its position,
     NaN for any height; bounds where ``only`` (K,).
     """

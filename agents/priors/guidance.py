@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from agents.diffusion.categorical import one_hot
 from agents.diffusion.gaussian import StepTable
 from agents.diffusion.reverse_steps import MixedStep, ReverseStep, state_of
-from agents.priors.claim_guidance import ClaimGuidance, claims_of
+from agents.priors.claim_guidance import ClaimGuidance, claims_of, names_of
 from scene_envs.arrays import constant_on
 from scene_envs.datasets.prompts.claims import (
     Claim,
@@ -76,13 +76,9 @@ class Estimating(Protocol):
 
 
 def position_std(prior: Estimating, step: int, table: StepTable) -> Tensor:
-    """(3,) standard deviation of the denoised positions at a step of a chain, m; 0 on axes without extent."""
+    """(3,) standard deviation of the denoised positions at a step of a chain, m, on the CPU; 0 without extent."""
     _, std = prior.estimate(step, table)
-    return _in_metres(std, prior.normalizer.scale[TRANSLATION].to(std))
-
-
-def _in_metres(std: Tensor, scale: Tensor) -> Tensor:
-    """(3,) deviations in metres of normalised ones; 0 where ``scale`` (3,) is 0."""
+    scale = prior.normalizer.scale[TRANSLATION].to(std)
     return torch.where(scale == 0, torch.zeros_like(scale), std / scale)
 
 
@@ -168,10 +164,8 @@ class NumberGuidance:
     """
 
     def __init__(self, prompts: Sequence[str], scene_type: str | SceneType) -> None:
-        library = get_scene_type(scene_type).library
-        kinds: dict[str, int] = {}
-        of_asset = [kinds.setdefault(asset.display_name, len(kinds)) for asset in library]
-        self._kinds = torch.tensor([*of_asset, len(kinds)])  # (K,); *empty* is a kind of its own, the last
+        kinds, of_asset = names_of(get_scene_type(scene_type).library)
+        self._kinds = F.pad(of_asset, (0, 1), value=len(kinds))  # (K,); *empty* is a kind of its own, the last
         self._bounds = [number_bounds(claims_of(prompt, scene_type)) for prompt in prompts]
         self._names = [*kinds, ""]
         self._member = F.one_hot(self._kinds, len(self._names)).double()  # (K, R)
@@ -328,8 +322,7 @@ def guidance_hook(
         physics_guidance: strength, 0 for none.
         guide, watch: callables of the caller.
     """
-    own = prior.normalizer.scale[TRANSLATION].cpu()
-    scale, moved = own.to(prior.device), moved.to(prior.device)
+    scale, moved = (there.to(prior.device) for there in (prior.normalizer.scale[TRANSLATION], moved))
     movable = moved.squeeze(-1)
     guides: list[Guide] = [] if guide is None else [guide]
     draw = None
@@ -339,9 +332,8 @@ def guidance_hook(
     if physics_guidance:
         guides.append(PhysicsGuidance(physics_guidance, movable))
     see = getattr(watch, "see", None)
-    estimates = [prior.estimate(step, table) for step in range(len(table))] if guides else []
-    errors = [_in_metres(std, own) for _, std in estimates]
-    there = torch.stack(errors or [own]).to(prior.device)
+    errors = [position_std(prior, step, table) for step in range(len(table))] if guides else []
+    there = torch.stack(errors).to(prior.device) if guides else scale
 
     def hook(step: int, x: Tensor, reverse: ReverseStep) -> ReverseStep:
         estimate = reverse.denoised
@@ -359,7 +351,7 @@ def guidance_hook(
             acts = getattr(each, "acts", None)
             shift = each(step, len(table), denoised, there[step]) if acts is None or acts(errors[step]) else None
             if shift is not None:
-                reverse = reverse.shifted(estimates[step][0] * scale * shift.to(scale) * moved)
+                reverse = reverse.shifted(prior.estimate(step, table)[0] * scale * shift.to(scale) * moved)
         rows = None if watch is None else watch(step, len(table), denoised)
         return reverse if rows is None else reverse.take(rows.to(x.device))
 

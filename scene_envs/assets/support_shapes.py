@@ -62,20 +62,11 @@ def library_shapes(library: AssetLibrary, device: torch.device) -> LibraryShapes
     levels = [_tiers(asset) for asset in assets]
     most = max(1, *(len(level) for level in levels))
     wells = np.array([_hollow(asset, *maps) for asset, *maps in zip(assets, top, wide, low, cell, strict=True)])
-    tables = {
-        "points": np.stack([np.concatenate([p, np.repeat(p[:1], size - len(p), axis=0)]).T for p in points]),
-        "center": np.stack([asset.center_of_mass for asset in assets]),
-        "bounds": np.stack([asset.bounds for asset in assets]),
-        "top": top,
-        "wide": wide,
-        "covered": covered,
-        "low": low,
-        "cell": cell,
-        "rim": wells[:, 0],
-        "well": wells[:, 1],
-        "tiers": np.stack([np.concatenate([level, np.full(most - len(level), np.nan)]) for level in levels]),
-        "static": np.array([asset.static for asset in assets]),
-    }
+    tables = {name: np.stack([getattr(asset, name) for asset in assets]) for name in ("bounds", "static")}
+    tables |= {"center": np.stack([asset.center_of_mass for asset in assets]), "rim": wells[:, 0], "well": wells[:, 1]}
+    tables |= {"top": top, "wide": wide, "covered": covered, "low": low, "cell": cell}
+    tables["points"] = np.stack([np.concatenate([p, np.repeat(p[:1], size - len(p), axis=0)]).T for p in points])
+    tables["tiers"] = np.stack([np.concatenate([level, np.full(most - len(level), np.nan)]) for level in levels])
     return LibraryShapes(**{name: torch.from_numpy(table.copy()) for name, table in tables.items()})
 
 
