@@ -71,7 +71,7 @@ class Placed:
         return values.new_full((*self.shape, *values.shape[1:]), blank).index_put((self.scene, self.slot), values)
 
     def carried(self, support: Tensor) -> Tensor:
-        """(B, N, N) bool: [i, j] whether object j is i, or is held by i, directly or not; ``support`` (n,) are slots."""
+        """(B, N, N) bool: [i, j] whether object j is i, or is held by i, directly or not; ``support`` (n,) is slots."""
         carried = torch.eye(self.shape[1], dtype=torch.bool, device=support.device).repeat(self.shape[0], 1, 1)
         scene, upper, lower, below = self.scene, self.slot, support, self.padded(support)
         while len(held := torch.nonzero(lower >= 0)[:, 0]):

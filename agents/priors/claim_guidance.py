@@ -346,7 +346,7 @@ def _sides(scenes: Scenes, table: Tensor, sharp: Tensor) -> list[Tensor]:
     cone = torch.stack([ahead - _CONE * across, ahead + _CONE * across], dim=1) / math.hypot(1.0, _CONE)
     return [
         *found, *more, _stand_at(scenes, comes, unit, level, apart),
-        _bound(*pair, _axes(rows)[:2], (known & beside)[:, None].expand(-1, 2), -reach, reach),
+        _bound(*pair, constant_on(_AXES, rows.device)[:2], (known & beside)[:, None].expand(-1, 2), -reach, reach),
         _bound(*pair, ahead[:, None], only, _OFFSET), _bound(*pair, cone, only.expand(-1, 2), 0.0),
     ]  # fmt: skip
 
@@ -478,10 +478,6 @@ _AROUND = torch.stack([_ROUND.cos(), _ROUND.sin()], dim=1)
 """Directions around an object."""
 
 
-def _axes(like: Tensor) -> Tensor:
-    return constant_on(_AXES, like.device)
-
-
 def _stand_on(scenes: Scenes, upper: Tensor, lower: Tensor, inside: Tensor) -> Tensor:
     """Constraints under which the objects ``upper`` (K,) stand on ``lower`` (K,), or lie in them."""
     reach = torch.where(inside, _WITHIN, _UPON)[:, None] * _at(scenes.sizes, lower)[:, :2]
@@ -489,7 +485,7 @@ def _stand_on(scenes: Scenes, upper: Tensor, lower: Tensor, inside: Tensor) -> T
     height = (surface + _at(scenes.foot, upper))[:, None]
     most = height + _LEVEL + torch.where(inside, _FILL, 0.0)[:, None]
     low, high = torch.cat([-reach, height - _LEVEL], dim=1), torch.cat([reach, most], dim=1)
-    return _bound(upper, lower, _axes(low), torch.ones_like(low, dtype=torch.bool), low, high)
+    return _bound(upper, lower, constant_on(_AXES, low.device), torch.ones_like(low, dtype=torch.bool), low, high)
 
 
 def _stand_beside(scenes: Scenes, scene: Tensor, upper: Tensor, lower: Tensor) -> Tensor:
@@ -517,9 +513,9 @@ def _stand_beside(scenes: Scenes, scene: Tensor, upper: Tensor, lower: Tensor) -
     best = (room - _OFF * torch.where(unit[:, None] >= 0, outside, 0.0)).argmax(dim=1)
     height = scenes.low[scene, below[scene, lower], 2] + scenes.foot[scene, upper]
     goal = torch.cat([places.gather(1, best[:, None, None].expand(-1, 1, 2))[:, 0], height[:, None]], dim=1) - middle
-    slack = torch.where(_axes(goal)[2] > 0, _LEVEL, _SPOT)
+    slack = torch.where(constant_on(_AXES, goal.device)[2] > 0, _LEVEL, _SPOT)
     pair, only = (scene * slots + upper, scene * slots + lower), torch.ones_like(goal, dtype=torch.bool)
-    return _bound(*pair, _axes(goal), only, goal - slack, goal + slack, stays=True)
+    return _bound(*pair, constant_on(_AXES, goal.device), only, goal - slack, goal + slack, stays=True)
 
 
 def _stand_at(scenes: Scenes, index: Tensor, unit: Tensor, level: Tensor, only: Tensor) -> Tensor:
@@ -530,4 +526,4 @@ def _stand_at(scenes: Scenes, index: Tensor, unit: Tensor, level: Tensor, only: 
     low, high = _at(scenes.low, unit) - center + margin, _at(scenes.high, unit) - center - margin
     low[:, 2] = level + _at(scenes.foot, index) - _LEVEL
     high[:, 2] = low[:, 2] + _LEVEL + _REST
-    return _bound(index, unit, _axes(low), (low < high) & only[:, None], low, high, stays=True)
+    return _bound(index, unit, constant_on(_AXES, low.device), (low < high) & only[:, None], low, high, stays=True)
