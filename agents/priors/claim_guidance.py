@@ -6,6 +6,7 @@ tables of numbers, and every operation runs over all scenes, on their device; on
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -24,6 +25,8 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 from scene_envs.supports import CONTACT, LARGEST_CONTACT, Contacts, Holding, Placed
+
+logger = logging.getLogger(__name__)
 
 _FINEST = 0.02
 """Error (m) of positions below which nothing is moved: the denoising that is left separates objects again."""
@@ -186,10 +189,11 @@ _NOWHERE, _UNKNOWN, _WHOLE = -9, -2, 99
 
 @lru_cache(maxsize=4096)
 def claims_of(prompt: str, scene_type: str | SceneType) -> tuple[Claim, ...]:
-    """The claims of a prompt; none where it cannot be read."""
+    """The claims of a prompt; none, with one warning, where it cannot be read."""
     try:
         return parse_prompt(prompt, scene_type).claims if prompt.strip() else ()
-    except InvalidInputError:
+    except InvalidInputError as error:
+        logger.warning("%s. claim_guidance does nothing for this prompt.", error)
         return ()
 
 

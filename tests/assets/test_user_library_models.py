@@ -152,20 +152,15 @@ def primitive(shape: str, inertial: str = "") -> str:
     ("shape", "size", "volume"),
     [
         ('<box size="0.1 0.06 0.04"/>', (0.1, 0.06, 0.04), 0.1 * 0.06 * 0.04),
-        # prisms and balls are inscribed, so a little smaller than pi says
-        ('<cylinder radius="0.05" length="0.2"/>', (0.1, 0.1, 0.2), 16 * np.sin(np.pi / 8) / 2 * 0.05**2 * 0.2),
-        ('<sphere radius="0.05"/>', (0.0966, 0.0966, 0.1), None),
-        ('<capsule radius="0.05" length="0.1"/>', (0.0966, 0.0966, 0.2), None),
+        ('<cylinder radius="0.05" length="0.2"/>', (0.1, 0.1, 0.2), np.pi * 0.05**2 * 0.2),
+        ('<sphere radius="0.05"/>', (0.0966, 0.0966, 0.1), 4 / 3 * np.pi * 0.05**3),
+        ('<capsule radius="0.05" length="0.1"/>', (0.0966, 0.0966, 0.2), np.pi * 0.05**2 * (0.1 + 4 / 3 * 0.05)),
     ],
 )
-def test_primitives(tmp_path: Path, shape: str, size: tuple[float, ...], volume: float | None) -> None:
+def test_primitives(tmp_path: Path, shape: str, size: tuple[float, ...], volume: float) -> None:
     asset = load(tmp_path, "p.urdf", primitive(shape), ", density: 1000")
     assert asset.bounds[1] - asset.bounds[0] == pytest.approx(size, abs=1e-4)
-    if volume is not None:
-        assert asset.mass == pytest.approx(1000 * volume)
-    else:
-        exact = np.pi * 0.05**2 * (0.1 * ("capsule" in shape) + 4 / 3 * 0.05)
-        assert 0.88 * exact < asset.mass / 1000 < exact
+    assert asset.mass == pytest.approx(1000 * volume)
     assert asset.bounds[0, 2] == 0.0
     flat = [part.vertices[:, 2] == 0.0 for part in asset.fine]
     assert max(int(corners.sum()) for corners in flat) >= 3  # it can stand

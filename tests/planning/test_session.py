@@ -217,16 +217,16 @@ def test_another_search_in_the_folder_is_refused(prior: ScenePrior, tmp_path: Pa
     [
         ({"budget": 0}, "budget=0 scenes do not cover the 3 first samples"),
         ({"max_nfe": 5}, "max_nfe=5 does not cover the 3 first samples .* raise it to 6"),
-        ({"max_seconds": 0}, "max_seconds=0 must be more than 0"),
+        ({"max_seconds": 0}, "max_seconds=0 must be a positive number"),
         ({"count": 0}, "count=0 must be at least 1"),
         ({"side_by_side": 0}, "side_by_side=0 must be at least 1"),
         ({"num_steps": 0}, "num_steps=0 must be"),
         ({"slots": 1}, "slots=1: scenes of .* need at least 2 slots"),
         ({"planner": "beem"}, "did you mean 'beam'"),
-        ({"planner": {"name": "beam", "width": 0}}, "planner beam: width must be a number >= 1, got 0"),
+        ({"planner": {"name": "beam", "width": 0}}, "planner beam: width=0 must be at least 1"),
         ({"planner": {"name": "mcts", "rollout": "some"}}, "unknown rollout 'some'"),
-        ({"planner": {"name": "evolution", "crossover": 2}}, "planner evolution: crossover=2.0 is a probability"),
-        ({"planner": {"name": "feynman_kac", "begin": 1}}, "planner feynman_kac: begin=1.0 is a share"),
+        ({"planner": {"name": "evolution", "crossover": 2}}, "planner evolution: crossover=2.0 is outside 0..1"),
+        ({"planner": {"name": "feynman_kac", "begin": 1}}, "planner feynman_kac: begin=1.0 must lie in"),
         ({"mask": {"name": "empty", "cuont": 1}}, "did you mean 'count'"),
     ],
 )
@@ -294,7 +294,7 @@ def test_an_interrupted_command_says_so_and_can_go_on(
     assert main(words) == status
     shown = capsys.readouterr()
     assert "by greedy with 12 denoiser evaluations" in shown.out
-    assert "the same command goes on" in shown.err
+    assert f"the same command with output={output} goes on where this one ended" in shown.err
     register_reward("interrupting")(Counting())
     assert main([*words, "max_seconds=1000", "count=1"]) == 0
     assert json.loads((output / "metrics.json").read_text())["nfe"] == 18

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys, PromptKeys
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Count, InvalidInputError, Natural, at_least
 
 if TYPE_CHECKING:
     from agents.priors.prior import ScenePrior
@@ -39,8 +39,8 @@ class InpaintingConfig(PromptKeys, DrawKeys):
 
     scenes: str = ""
     prior: str = ""
-    count: int | None = None
-    pictures: int = 12
+    count: Count | None = None
+    pictures: Natural = 12
     output: str = ""
 
     def in_parts(self, batch: SceneBatch, change: Callable[..., SceneBatch], **keys: Any) -> SceneBatch:
@@ -80,8 +80,16 @@ def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[Sce
 
 
 def save_scenes(before: SceneBatch, after: SceneBatch, pictures: int, run: Run, figures: dict[str, float]) -> None:
-    """Write the scenes, both galleries and the metrics."""
+    """Write the scenes, both galleries and the metrics, with the shares of free objects that are feasible."""
+    from agents.evaluation.physics_figures import leaving_out
+    from scene_envs.physics import feasibility
+
     after.save(run.directory / "scenes.safetensors")
+    with leaving_out("feasible", {}):
+        for name, batch in (("feasible_before", before), ("feasible", after)) if before.scene_type.has_geometry else ():
+            verdict, free = feasibility(batch), batch.is_free
+            figures[name] = float(verdict.feasible.sum() / free[verdict.valid].sum().clamp(min=1))
+            run.say(f"{name.replace('_', ' ')}: {figures[name]:.0%} of the free objects")
     draw_scenes(before, pictures, run, "before.png")
     draw_scenes(after, pictures, run, "gallery.png")
     run.write_metrics({"scenes": len(after), **figures})
@@ -97,8 +105,8 @@ class CompleteConfig(InpaintingConfig):
         fill: most objects to add to a scene; null for as many as there are empty slots.
     """
 
-    slots: int | None = None
-    fill: int | None = None
+    slots: Count | None = None
+    fill: Annotated[int, at_least(0)] | None = None
 
 
 def run_complete(settings: CompleteConfig, run: Run) -> None:

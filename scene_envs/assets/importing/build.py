@@ -19,9 +19,9 @@ from scene_envs.assets.importing.limits import seconds_left
 from scene_envs.assets.importing.mesh_files import (
     MESH_SUFFIXES,
     Color,
-    Inertial,
     Model,
     Shape,
+    heavier,
     merged_inertial,
     pose_of,
 )
@@ -202,33 +202,36 @@ class Weight(NamedTuple):
 
 
 def weigh(
-    given: Inertial | None, parts: Sequence[ConvexPart], volume: float, mass: float | None, density: float | None
+    given: MassProperties | None, parts: Sequence[ConvexPart], solid: MassProperties, entry: AssetEntry
 ) -> Weight:
-    """Mass properties of an asset of these fine parts and this ``volume`` (m^3). Those ``given`` by the file are kept
-    where they are possible. A user's ``mass`` (kg) keeps the file's distribution; a user's ``density`` (kg/m^3) fills
-    the shape evenly.
+    """Mass properties of an asset of these fine parts whose ``solid`` is given at 1 kg/m^3. Those ``given`` by the file
+    are kept where they are possible; an inertia of zeros is missing. A user's ``mass`` (kg) keeps the file's
+    distribution; a user's ``density`` (kg/m^3) fills the shape evenly.
     """
-    if density is not None:
-        return Weight(mass_properties(parts, density * volume), (), ())
+    mass = entry.mass
+    if entry.density is not None:
+        return Weight(heavier(solid, entry.density), (), ())
     if given is None or given.mass <= 0:
         known = "inertia computed from the shape"
         if mass is None:
-            known, mass = f"mass and {known} at {DEFAULT_DENSITY:g} kg/m^3", DEFAULT_DENSITY * volume
+            known, mass = f"mass and {known} at {DEFAULT_DENSITY:g} kg/m^3", DEFAULT_DENSITY * solid.mass
         why = "the file gives none" if given is None else f"the file gives a mass of {given.mass:g} kg"
-        return Weight(mass_properties(parts, mass), (f"{known}: {why}",), ())
+        return Weight(heavier(solid, mass / solid.mass), (f"{known}: {why}",), ())
     if mass is None:
-        found = given.mass / volume
+        found = given.mass / solid.mass
         if not _POSSIBLE[0] <= found <= _POSSIBLE[1]:
             reason = f"the file's {given.mass:g} kg would be {found:.3g} kg/m^3"
             text = f"mass and inertia recomputed at {DEFAULT_DENSITY:g} kg/m^3: {reason}"
-            return Weight(mass_properties(parts, DEFAULT_DENSITY * volume), (), (text,))
+            return Weight(heavier(solid, DEFAULT_DENSITY), (), (text,))
         mass = given.mass
-    computed = mass_properties(parts, mass)
-    inertia = given.inertia * (mass / given.mass)
-    wrong = why_impossible(inertia, given.center_of_mass, parts, computed)
+    inertia, even = given.inertia * (mass / given.mass), heavier(solid, mass / solid.mass)
+    notes: tuple[str, ...] = ()
+    if not inertia.any():
+        inertia, notes = even.inertia, ("inertia computed from the shape: the file gives none",)
+    wrong = why_impossible(inertia, given.center_of_mass, parts, even)
     if wrong:
-        return Weight(computed, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
-    return Weight(MassProperties(mass, given.center_of_mass, 0.5 * (inertia + inertia.T)), (), ())
+        return Weight(even, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
+    return Weight(MassProperties(mass, given.center_of_mass, 0.5 * (inertia + inertia.T)), notes, ())
 
 
 def why_impossible(inertia: Array, center: Array, parts: Sequence[ConvexPart], computed: MassProperties) -> str:
@@ -334,17 +337,19 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     size = _diagonal(shapes)
     if not _SMALL <= size <= _LARGE:
         warnings.append(f"it is {size:.3g} m large; if the file is not in metres, set `scale`")
-    parts, volume = _collide(shapes, entry, size, path, notes, warnings)
+    parts, solid = _collide(shapes, entry, size, path, notes, warnings)
     static = model.static is True if entry.welded is None else entry.welded
     if entry.welded is None and (entry.mass is not None or entry.density is not None):
         static = False
     given = merged_inertial(model.inertials) if model.inertials else None
-    weight = weigh(given, parts, volume, entry.mass, entry.density)
+    weight = weigh(given, parts, solid, entry)
     properties = mass_properties(parts, 0.0) if static else weight.properties
     if not static:
         notes += weight.notes
         warnings += weight.warnings
     visual = join(*(mesh for shape in model.visuals or shapes for mesh in visual_of(shape, entry.color)))
+    meshes = [shape for shape in (*model.visuals, *shapes) if shape.kind == "mesh"]
+    notes += dict.fromkeys(note for shape in meshes for mesh in meshes_of(shape) for note in mesh.metadata["notes"])
     shift = _shift(parts, entry, visual if static else None)
     apart = float(np.abs(np.asarray(visual.bounds) - bounds_of(parts)).max())
     if apart > max(_UNLIKE, 0.05 * size):
@@ -366,7 +371,7 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
         static=static,
     )
     x, y, z = (shift + 0.0).tolist()
-    density = 0.0 if static else properties.mass / volume
+    density = 0.0 if static else properties.mass / solid.mass
     remarks = tuple(notes), tuple(warnings)
     return asset, AssetReport(entry.name, path, properties.mass, density, len(fine), (x, y, z), *remarks)
 
@@ -378,6 +383,7 @@ def _read(path: Path) -> Model:
     if suffix == ".sdf":
         return read_sdf(path)
     shape = Shape("mesh", (1.0, 1.0, 1.0), np.eye(4), "the mesh", path)
+    shape = dataclasses.replace(shape, pose=pose_of(np.zeros(3), meshes_of(shape)[0].metadata["upright"]))
     return Model(visuals=(shape,), collisions=(shape,))
 
 
@@ -390,7 +396,7 @@ def _scaled(model: Model, entry: AssetEntry) -> Model:
         return dataclasses.replace(old, pose=pose, size=tuple(scale * s for s in old.size))
 
     inertials = tuple(
-        Inertial(i.mass * scale**3, scale * turn @ i.center_of_mass, scale**5 * turn @ i.inertia @ turn.T)
+        MassProperties(i.mass * scale**3, scale * turn @ i.center_of_mass, scale**5 * turn @ i.inertia @ turn.T)
         for i in model.inertials
     )
     notes = model.notes
@@ -428,11 +434,12 @@ def _diagonal(shapes: Sequence[Shape]) -> float:
 
 def _collide(
     shapes: Sequence[Shape], entry: AssetEntry, size: float, path: Path, notes: list[str], warnings: list[str]
-) -> tuple[list[ConvexPart], float]:
-    """Fine parts of all shapes and the volume (m^3) they fill; adds remarks to ``notes`` and ``warnings``."""
+) -> tuple[list[ConvexPart], MassProperties]:
+    """Fine parts of all shapes and their solid at 1 kg/m^3; adds remarks to ``notes`` and ``warnings``."""
     tolerance = min(_CONVEX * size, _MAX_CONVEX)
     parts: list[ConvexPart] = []
-    volume, repeated = 0.0, 0
+    solids: list[MassProperties] = []
+    repeated = 0
     seen: set[bytes] = set()
     for shape in shapes:
         found = collision_of(shape, entry.decomposition, tolerance, entry.concavity)
@@ -442,7 +449,7 @@ def _collide(
             continue
         seen.add(key)
         parts += found.parts
-        volume += found.volume
+        solids.append(found.solid)
         seconds_left()
         notes += [note for note in found.notes if note not in notes]
         warnings += [warning for warning in found.warnings if warning not in warnings]
@@ -456,7 +463,7 @@ def _collide(
         notes.append(f"{thin} of {len(parts)} parts thinner than 3 mm (the thinnest {1e3 * min(widths):.2g} mm)")
     if len(parts) > _MANY_PARTS:
         notes.append(f"{len(parts)} parts; physics will be slow, a larger `concavity` gives fewer")
-    return parts, volume
+    return parts, merged_inertial(solids)
 
 
 def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trimesh | None) -> Array:

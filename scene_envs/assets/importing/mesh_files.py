@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from unittest.mock import patch
+from urllib.parse import unquote
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
+from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
 from scene_envs.assets.importing.limits import check_file, check_triangles, seconds_left
+from scene_envs.assets.shapes import MassProperties
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, SceneEnvsError
 
 if TYPE_CHECKING:
@@ -23,6 +31,7 @@ if TYPE_CHECKING:
 
 
 Color = tuple[int, int, int]
+Indices = NDArray[np.int64]
 Kind = Literal["mesh", "box", "cylinder", "sphere", "capsule", "ellipsoid"]
 MESH_SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 """Mesh files that can be read."""
@@ -42,8 +51,10 @@ _SAMPLES = np.array(
 ) / 4.0  # fmt: skip
 """Barycentric points (15, 3) at which a texture is read to colour a triangle."""
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-_PREFIXED = re.compile(rb"(</?)([A-Za-z_][\w.-]*):([A-Za-z_][\w.-]*)")
-"""An element with a namespace prefix, such as <drake:declare_convex/>."""
+_UPRIGHT = {"X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "Z_UP": np.eye(3)}
+FORMATS: dict[str, Any] = json.loads(Path(__file__).with_name("formats.json").read_text("utf-8"))
+"""What is read and left out of formats: children and @attributes of elements, those with a * any number of times."""
+_BEFORE_XML = re.compile(rb"\A(?:\s|\xef\xbb\xbf|<!--.*?-->)+(?=<\?xml\s)", re.DOTALL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,15 +70,8 @@ class Shape:
     path: Path | None = None  # file of a mesh
     color: Color | None = None  # colour (r, g, b) given by the model, or None
     is_convex: bool = False  # whether the model declares the mesh convex
-
-
-@dataclass(frozen=True, eq=False)
-class Inertial:
-    """Mass (kg), centre of mass (3,) m and inertia (3, 3) kg m^2 about that centre, model axes."""
-
-    mass: float
-    center_of_mass: Array
-    inertia: Array
+    part: tuple[str, bool] | None = None  # the one object of a mesh file, and whether its box is centred at the origin
+    density: float | None = None  # kg/m^3, given by the model
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +80,7 @@ class Model:
 
     visuals: tuple[Shape, ...]  # shapes to draw
     collisions: tuple[Shape, ...]  # shapes for collisions
-    inertials: tuple[Inertial, ...] = ()  # inertials of the links that have one
+    inertials: tuple[MassProperties, ...] = ()  # inertials of the links that have one
     static: bool | None = None  # whether the model is fixed to the world; None when the file does not say
     notes: tuple[str, ...] = field(default=())  # choices of the reader that the file may not intend
 
@@ -93,14 +97,19 @@ def from_roll_pitch_yaw(angles: Array) -> Array:
     return np.asarray(Rotation.from_euler("xyz", angles).as_matrix())
 
 
-def moved_inertial(pose: Array, inertial: Inertial) -> Inertial:
+def moved_inertial(pose: Array, inertial: MassProperties) -> MassProperties:
     """The inertial of a link in the frame that ``pose`` (4, 4) maps to."""
     turn = pose[:3, :3]
     center = turn @ inertial.center_of_mass + pose[:3, 3]
-    return Inertial(inertial.mass, center, turn @ inertial.inertia @ turn.T)
+    return MassProperties(inertial.mass, center, turn @ inertial.inertia @ turn.T)
 
 
-def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
+def heavier(inertial: MassProperties, factor: float) -> MassProperties:
+    """The inertial of the same body with ``factor`` times the density."""
+    return MassProperties(inertial.mass * factor, inertial.center_of_mass, inertial.inertia * factor)
+
+
+def merged_inertial(inertials: Sequence[MassProperties]) -> MassProperties:
     """The inertial of several bodies joined to one: masses add, inertias by the parallel-axis theorem."""
     mass = sum(inertial.mass for inertial in inertials)
     weights = [inertial.mass / mass if mass > 0 else 1.0 / len(inertials) for inertial in inertials]
@@ -109,16 +118,17 @@ def merged_inertial(inertials: tuple[Inertial, ...]) -> Inertial:
     for inertial in inertials:
         arm = inertial.center_of_mass - center
         total += inertial.inertia + inertial.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    return Inertial(mass, center, total)
+    return MassProperties(mass, center, total)
 
 
 def read_mesh(path: Path) -> list[trimesh.Trimesh]:
-    """The triangle meshes of a file, z up, in the unit of the file.
+    """The triangle meshes of a file, in its axes and unit.
 
-    Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned; the up axis and
-    the unit that a COLLADA file names are applied. Raises InvalidInputError (no such file, unknown format, beyond the
-    limits), CorruptFileError (unreadable, no triangles, not finite) and MissingDependencyError (COLLADA without
-    pycollada).
+    Objects of an OBJ and nodes of a scene stay apart. glTF is y up by its specification and is turned to z up. Metadata
+    of each mesh are its ``names`` in the file, ``notes`` on what is not loaded, and the rotation ``upright`` (3, 3) of
+    the up axis that a COLLADA file names, which RViz, Gazebo and PyBullet do not apply inside a URDF, to z up. Raises
+    InvalidInputError (no such file, unknown format, beyond the limits), CorruptFileError (unreadable, no triangles, not
+    finite) and MissingDependencyError (COLLADA without pycollada).
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -131,12 +141,14 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     check_file(path)
     import trimesh
 
-    options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
+    content = _Content(path)
     try:
-        scene: Any = trimesh.load_scene(str(path), process=False, **options)
+        _PREPARED.get(suffix, lambda content: None)(content)
+        scene = content.load()
         for geometry in scene.geometry.values():
             _check_texture(geometry, path)
-        pieces = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+        found = scene.dump()
+        pieces = [mesh for mesh in found if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     except SceneEnvsError:
         raise
     except ImportError as error:
@@ -147,16 +159,227 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise CorruptFileError(f"{path} cannot be read as a {suffix[1:].upper()} mesh: {reason}") from error
+    if len(pieces) < len(found):
+        content.notes.append(f"{len(found) - len(pieces)} object(s) of points or lines left out")
     if not pieces:
         raise CorruptFileError(f"{path} holds no triangles")
     for mesh in pieces:
         _check_mesh(mesh, path)
     check_triangles(path, sum(len(mesh.faces) for mesh in pieces))
     seconds_left()
-    turn = _axes(path)
     for mesh in pieces:
-        mesh.vertices = mesh.vertices @ turn.T
+        mesh.vertices = mesh.vertices @ content.axes.T
+        own = {str(mesh.metadata.get(key)) for key in ("name", "node")}
+        mesh.metadata["upright"] = content.upright
+        mesh.metadata["names"] = own | content.names_of(str(mesh.metadata.get("name")))
+        mesh.metadata["notes"] = tuple(f"{path.name}: {note}" for note in dict.fromkeys(content.notes))
     return pieces
+
+
+class _Content:
+    """The content of a mesh file on its way to trimesh, which reads less than the formats hold."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.type = path, path.suffix.lower()[1:]
+        self.data = path.read_bytes()
+        self.axes, self.upright = np.eye(3), np.eye(3)  # to the axes and unit of its meshes, and from these to z up
+        self.notes: list[str] = []  # what is not loaded
+        self.scales: list[float] = []  # of the geometries, in the order of trimesh; 1 where there are fewer
+        self.names: dict[str, str] = {}  # of the objects of the file, by what trimesh begins their names with
+
+    def load(self) -> Any:
+        """The scene that trimesh makes of the data."""
+        import trimesh
+
+        options: dict[str, Any] = {"obj": {"split_objects": True}, "dae": {"ignore_broken": False}}.get(self.type, {})
+        resolver = trimesh.resolvers.FilePathResolver(str(self.path))
+        try:
+            with patch("collada.polylist.Polylist.triangleset", _triangleset) if self.type == "dae" else nullcontext():
+                scene = trimesh.load_scene(BytesIO(self.data), self.type, resolver, process=False, **options)
+        except Exception as error:
+            if self.type != "dae" or not _drop_looks(self, error):
+                raise
+            return self.load()
+        for geometry in scene.geometry.values() if self.type == "ply" else ():
+            _cut_again(geometry)
+        for geometry, scale in zip(scene.geometry.values(), self.scales, strict=False):
+            geometry.vertices = geometry.vertices * scale
+        return scene
+
+    def names_of(self, name: str) -> set[str]:
+        """The names in the file of an object that trimesh calls ``name``."""
+        begin = [known for known in self.names if name == known or name.startswith(f"{known}_")]
+        longest = max(begin, key=len, default="")
+        return {longest, self.names[longest]} if longest else set()
+
+    def expect(self, names: Iterable[str], what: str) -> None:
+        """Note the files of these names that are not there."""
+        for name in dict.fromkeys(names):
+            if name and not any((self.path.parent / n).is_file() for n in (name, unquote(name.replace("\\", "/")))):
+                self.notes.append(f"its {what} {name!r} is not there")
+
+
+def cut_polygons(points: Array, corners: Indices, counts: Indices) -> tuple[Indices, Indices]:
+    """Triangles (T, 3) of polygons of any shape, as positions in ``corners``, which are rows of ``points`` (V, 3), and
+    their polygons (T,). A polygon has ``counts`` corners. Convex ones are fans, others lose one ear after another.
+
+    >>> dart = np.array([[0.0, 0, 0], [2, 1, 0], [0, 2, 0], [1, 1, 0]])
+    >>> cut_polygons(dart, np.arange(4), np.array([4]))[0].tolist()
+    [[3, 0, 1], [1, 2, 3]]
+    """
+    starts, at = np.cumsum(counts) - counts, np.arange(len(corners))
+    own = np.repeat(np.arange(len(counts)), counts)
+    after = np.where(at + 1 < (starts + counts)[own], at + 1, starts[own])
+    ring = points[corners]
+    arms, edges = ring - ring[starts[own]], ring[after] - ring
+    normals = np.stack([np.bincount(own, part, len(counts)) for part in np.cross(arms, arms[after]).T], axis=1)
+    turns = (np.cross(edges, edges[after]) * normals[own]).sum(axis=1)
+    bent = (turns <= 1e-9 * (normals**2).sum(axis=1)[own]) & (counts[own] > 3)
+    inner = (at > starts[own]) & (after > at)
+    rows, polygons = np.column_stack([starts[own], at, after])[inner], own[inner]
+    for index in np.unique(own[bent]):
+        first, last = np.searchsorted(polygons, (index, index + 1))
+        rows[first:last] = starts[index] + _ears(ring[starts[index] :][: counts[index]], normals[index])
+    return rows, polygons
+
+
+def _ears(ring: Array, normal: Array) -> Indices:
+    """Triangles (n - 2, 3) of a polygon (n, 3) with its normal, ear after ear."""
+    axis = int(np.abs(normal).argmax())
+    flat = ring[:, (axis + 1) % 3] + 1j * ring[:, (axis + 2) % 3] * (np.sign(normal[axis]) or 1.0)  # counterclockwise
+
+    def side(a: complex, b: complex, c: Any) -> Any:  # above 0 where c lies left of a to b
+        return (np.conj(b - a) * (c - a)).imag
+
+    tiny = 1e-9 * float(np.abs(flat - flat[0]).max()) ** 2
+    left, found = list(range(len(ring))), []
+    while len(left) > 3:
+        for ear in (*range(len(left)), 0):
+            a, b, c = flat[left[ear - 1]], flat[left[ear]], flat[left[(ear + 1) % len(left)]]
+            others = np.setdiff1d(flat[left], (a, b, c))
+            inside = (side(a, b, others) >= -tiny) & (side(b, c, others) >= -tiny) & (side(c, a, others) >= -tiny)
+            if side(a, b, c) > tiny and not inside.any():
+                break
+        found.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
+        del left[ear]
+    return np.array([*found, left])
+
+
+def _prepare_obj(content: _Content) -> None:
+    """Polygons cut into triangles, relative indices made absolute, and what is not loaded."""
+    from trimesh.util import decode_text
+
+    text = decode_text(content.data).replace("\r\n", "\n").replace("\\\n", " ")
+    if re.search(r"^[ \t]+\S|^[a-z]+\t", text, re.MULTILINE):
+        text = re.sub(r"^[ \t]*([a-z]\w*)[ \t]+", r"\1 ", text, flags=re.MULTILINE)
+    content.names |= {name: name for name in re.findall(r"^o (.+?)\s*$", text, re.MULTILINE)}
+    libraries = re.findall(r"^mtllib (.+?)\s*$", text, re.MULTILINE)
+    content.expect(libraries[:1], "material file")
+    content.notes += [f"its second material file {name!r} is not read" for name in libraries[1:]]
+    for library in [content.path.parent / name for name in libraries[:1]]:
+        materials = decode_text(library.read_bytes()) if library.is_file() else ""
+        content.expect(re.findall(r"^\s*map_Kd\s+(.+?)\s*$", materials, re.MULTILINE | re.IGNORECASE), "texture")
+    if re.search(r"^(?:l|p|curv2?|surf) ", text, re.MULTILINE):
+        content.notes.append("its points, lines and curves are left out")
+    if re.search(r"^f(?: +[^\s#]+){4}|^f[^\n]*[ /]-", text, re.MULTILINE):
+        text = _cut_faces(text.split("\n"), content.path)
+    content.data = text.encode()
+
+
+def _cut_faces(lines: list[str], path: Path) -> str:
+    """The text of an OBJ with triangles for its polygons."""
+    points: list[list[float]] = []
+    faces: dict[int, list[str]] = {}  # corners by line
+    sizes = {"v": 0, "vt": 0, "vn": 0}
+    for number, line in enumerate(lines):
+        key, _, rest = line.partition(" ")
+        if key in sizes:
+            sizes[key] += 1
+            if key == "v":
+                points.append([float(word) for word in rest.split()[:3]])
+        elif key == "f":
+            lines[number], faces[number] = "", rest.partition("#")[0].split()
+            for at, corner in enumerate(faces[number] if "-" in rest else ()):  # a relative index counts back from here
+                split = zip(corner.split("/"), sizes.values(), strict=False)
+                place = [str(size + 1 + int(word)) if word[:1] == "-" else word for word, size in split]
+                faces[number][at] = "/".join(place)
+    words = [corner for corners in faces.values() for corner in corners]
+    index = np.array([int(word.partition("/")[0]) - 1 for word in words], dtype=np.int64)
+    if index.min() < 0 or index.max() >= len(points):
+        raise CorruptFileError(f"{path}: a face refers to vertex {index.max() + 1} of {len(points)}")
+    counts = np.array([len(corners) for corners in faces.values()], dtype=np.int64)
+    numbers, found = list(faces), cut_polygons(np.array(points), index, counts)
+    for row, polygon in zip(found[0].tolist(), found[1].tolist(), strict=True):
+        lines[numbers[polygon]] += "f " + " ".join(words[at] for at in row) + "\n"
+    return "\n".join(lines)
+
+
+def _prepare_dae(content: _Content) -> None:
+    """Unit and up axis; skins and lines left out, which trimesh does not read, and cameras, lights and animations."""
+    root = _parsed(content.data, content.path)
+    if (unit := root.find("asset/unit")) is not None:
+        content.axes = np.eye(3) * positive(unit.get("meter", "1"), 1, content.path, "unit of the asset")[0]
+    content.upright = _UPRIGHT.get((root.findtext("asset/up_axis") or "").strip(), _Y_UP)
+    images = [(i.text or "").strip() for i in root.findall("library_images/image//init_from")]
+    known = {i.get(key) for key, tag in (("id", "image"), ("sid", "newparam")) for i in root.iter(tag)}
+    images += [i.get("texture", "") for i in root.iter("texture") if i.get("texture") not in known]
+    content.expect([image.removeprefix("file://") for image in images], "texture")
+    content.names |= {geometry.get("id", ""): geometry.get("name", "") for geometry in root.iter("geometry")}
+    unused, named = FORMATS["COLLADA"].values()
+    for parent in list(root.iter()):
+        for child in list(parent):
+            kind = child.tag.removeprefix("instance_").removeprefix("library_")
+            if kind in named or kind in unused:
+                content.notes += [f"its {named[kind]} are left out"] if kind in named else []
+                parent.remove(child)
+    content.data = ElementTree.tostring(root)
+
+
+def _triangleset(polygons: Any) -> Any:
+    """The triangles of polygons of pycollada, which itself cuts concave ones as fans."""
+    from collada.triangleset import TriangleSet
+
+    cut = cut_polygons(polygons.vertex, polygons.vertex_index, np.asarray(polygons.vcounts))[0]
+    return TriangleSet(polygons.sources, polygons.material, polygons.index[cut].ravel(), polygons.xmlnode)
+
+
+def _drop_looks(content: _Content, error: Exception) -> bool:
+    """Leave out the materials of a COLLADA file, which pycollada cannot read; False when there are none."""
+    root = _parsed(content.data, content.path)
+    looks = ("library_images", "library_effects", "library_materials", "bind_material")
+    found = [(parent, child) for parent in root.iter() for child in parent if child.tag in looks]
+    for parent, child in found:
+        parent.remove(child)
+    if found:
+        content.notes.append(f"its materials cannot be read ({' '.join(str(error).split())}); drawn without")
+        content.data = ElementTree.tostring(root)
+    return bool(found)
+
+
+def _prepare_off(content: _Content) -> None:
+    """The same mesh as an OBJ."""
+    from trimesh.util import comment_strip, decode_text
+
+    lines = comment_strip(decode_text(content.data)).split("OFF", 1)[-1].split("\n")
+    rows = [line.split() for line in lines if line.strip()]
+    vertices, faces = int(rows[0][0]), int(rows[0][1])
+    text = ["v " + " ".join(row[:3]) for row in rows[1 : vertices + 1]]
+    for row in rows[vertices + 1 : vertices + faces + 1]:
+        text.append("f " + " ".join(str(int(word) + 1) for word in row[1 : int(row[0]) + 1]))
+    content.type, content.data = "obj", "\n".join(text).encode()
+    _prepare_obj(content)
+
+
+def _cut_again(mesh: Any) -> None:
+    """Triangles of the polygons of a PLY, which trimesh cuts as fans."""
+    raw = mesh.metadata["_ply_raw"]
+    data = raw.get("face", {}).get("data")
+    names = data if isinstance(data, dict) else getattr(getattr(data, "dtype", None), "names", None) or ()
+    for name in [name for name in names if name.startswith("vertex_ind")]:
+        found = data[name] if isinstance(data, dict) else data[name]["f1"]
+        counts, corners = np.array([len(face) for face in found]), np.concatenate([*found]).astype(np.int64)
+        if (counts > 3).any() and len(mesh.vertices) == raw["vertex"]["length"] > corners.max():
+            mesh.faces = corners[cut_polygons(np.asarray(mesh.vertices), corners, counts)[0]]
 
 
 def _check_content(path: Path) -> None:
@@ -195,19 +418,48 @@ def _check_texture(mesh: Any, path: Path) -> None:
         )
 
 
-def _axes(path: Path) -> Array:
-    """(3, 3): file axes and unit to z up and metres, where the format defines them."""
-    suffix = path.suffix.lower()
-    if suffix in (".glb", ".gltf"):
-        return _Y_UP
-    if suffix != ".dae":
-        return np.eye(3)
-    asset = ElementTree.parse(path).getroot().find("{*}asset")
-    up = (asset.findtext("{*}up_axis") or "Y_UP").strip() if asset is not None else "Y_UP"
-    unit = asset.find("{*}unit") if asset is not None else None
-    meter = float(unit.get("meter", "1")) if unit is not None else 1.0
-    turns = {"X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "Z_UP": np.eye(3)}
-    return meter * turns.get(up, _Y_UP)
+def _prepare_gltf(content: _Content) -> None:
+    """Scales of quantised positions, and what is not loaded; refuses by its name what trimesh does not read."""
+    content.axes = _Y_UP
+    looks, lost = (tuple(names.split()) for names in FORMATS["glTF"].values())
+    size = int.from_bytes(content.data[12:16], "little")
+    header = json.loads(content.data[20 : 20 + size] if content.type == "glb" else content.data)
+    accessors, nodes, meshes = header.get("accessors", []), header.get("nodes", []), header.get("meshes", [])
+    primitives = [primitive for mesh in meshes for primitive in mesh["primitives"]]
+    lacking = [name for name in header.get("extensionsRequired", ()) if not name.startswith(looks)]
+    lacking += [name for node in nodes for name in node.get("extensions", ()) if name == "EXT_mesh_gpu_instancing"]
+    lacking += ["triangle strips or fans" for primitive in primitives if primitive.get("mode", 4) in (5, 6)]
+    lacking += ["sparse accessors" for accessor in accessors if "sparse" in accessor]
+    lacking += ["a mesh below a camera" for node in nodes if "camera" in node and {"mesh", "children"} & {*node}]
+    lacking += ["no scene"] * (not header.get("scenes"))
+    for primitive in primitives:
+        position = accessors[primitive["attributes"]["POSITION"]]
+        if "bufferView" not in position and "sparse" not in position:
+            lacking += primitive.get("extensions") or ["meshes without data"]
+        step = np.iinfo("bBhH"[position["componentType"] - 5120]).max if position.get("normalized") else 1
+        content.scales += [1.0 / step] * (primitive.get("mode", 4) in (0, 1, 4))
+        uv = primitive["attributes"].get("TEXCOORD_0")
+        lacking += ["quantised texture coordinates"] * (uv is not None and accessors[uv]["componentType"] != 5126)
+    if lacking:
+        raise InvalidInputError(
+            f"{content.path} holds {', '.join(dict.fromkeys(lacking))}, which cannot be read; export it without "
+            "(compression and instancing are options of the exporter)"
+        )
+    used = {n for n in header.get("extensionsUsed", ()) if n in lost or not n.startswith(looks)}
+    used |= {what for key, what in (("animations", "animations"), ("skins", "skins")) if key in header}
+    used |= {"morph targets" for some in [*nodes, *meshes] if any(some.get("weights", ()))}
+    content.notes += [f"its {name} is not applied" for name in sorted(used)]
+    uris = [image.get("uri", "data:") for image in header.get("images", ())]
+    content.expect([uri for uri in uris if not uri.startswith("data:")], "texture")
+    content.names |= {mesh["name"]: mesh["name"] for mesh in meshes if "name" in mesh}
+    roots = {*range(len(nodes))} - {child for node in nodes for child in node.get("children", ())}
+    if apart := len(roots - {*header["scenes"][header.get("scene", 0)].get("nodes", ())}):
+        content.notes.append(f"{apart} node(s) outside its scene are left out")
+
+
+_PREPARED = {
+    ".obj": _prepare_obj, ".off": _prepare_off, ".dae": _prepare_dae, ".glb": _prepare_gltf, ".gltf": _prepare_gltf
+}  # fmt: skip
 
 
 def bare(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -333,22 +585,26 @@ def _corner_normals(mesh: trimesh.Trimesh) -> Array:
 
 
 def read_xml(path: Path) -> Element:
-    """The root element of an XML file; prefixes that are never declared are tolerated. Raises CorruptFileError, with
-    the line, for a file that cannot be read or is no XML, and as :func:`check_file` does.
+    """The root element of an XML file. Names keep their prefixes, which need no declaration, and comments may come
+    before the declaration, as in other readers. Raises CorruptFileError, with the line, for a file that cannot be read
+    or is no XML, and as :func:`check_file` does.
     """
     check_file(path)
     try:
-        data = path.read_bytes()
+        return _parsed(path.read_bytes(), path)
     except OSError as error:
         raise CorruptFileError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def _parsed(data: bytes, path: Path) -> Element:
+    """The root element of the content of the XML file at ``path``."""
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler, parser.CharacterDataHandler = builder.start, builder.data
+    parser.EndElementHandler = builder.end
     try:
-        return ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
-        if "unbound prefix" in str(error):
-            try:
-                return ElementTree.fromstring(_PREFIXED.sub(rb"\1\2.\3", data))
-            except ElementTree.ParseError as other:
-                error = other
+        parser.Parse(_BEFORE_XML.sub(b"", data), True)
+        return builder.close()
+    except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: its encoding
         raise CorruptFileError(f"{path} is not well-formed XML: {error}") from error
 
 
@@ -388,27 +644,41 @@ def color_of(text: str | None, path: Path, where: str) -> Color | None:
 
 
 def find_mesh(uri: str, path: Path, where: str) -> Path:
-    """The file that ``uri`` names in the model at ``path``: relative, absolute, file://, package:// or model://. A
-    package is searched above the model and in ``ROS_PACKAGE_PATH``; InvalidInputError names the places searched.
+    """The file that ``uri`` names in the model at ``path``: relative, absolute, file://, package:// or model://.
+
+    A package is a folder above the model, or beside one of these, with that name or with that name in its
+    ``package.xml``, or a folder of the paths of ROS and Gazebo. InvalidInputError names the places searched.
     """
     text = uri.strip()
     scheme, separator, rest = text.partition("://")
     if not separator:
         scheme, rest = "", text
-    rest = rest.replace("\\", "/")
-    folder = path.parent
-    candidates = [Path(rest)] if scheme == "file" else [folder / rest]
-    if scheme in ("package", "model"):
-        package, _, inside = rest.partition("/")
-        for parent in (folder, *folder.parents):
-            candidates += [parent / rest, parent / inside] if parent.name == package else [parent / rest]
-        roots = filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep))
-        candidates += [candidate for root in roots for candidate in (Path(root) / rest, Path(root) / inside)]
-        candidates.append(folder / inside)
-    elif scheme not in ("", "file"):
+    if scheme not in ("", "file", "package", "model"):
         raise InvalidInputError(f"{path}: {where} refers to {uri!r}; only files, package:// and model:// can be read")
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate.resolve()
-    more = ", the folders above it or ROS_PACKAGE_PATH" if scheme in ("package", "model") else ""
-    raise InvalidInputError(f"{path}: {where} refers to the mesh {uri!r}, which does not exist in {folder}{more}")
+    for named in dict.fromkeys((rest, unquote(rest))):
+        for candidate in _places(scheme, Path(named.replace("\\", "/")), path.parent):
+            if candidate.is_file():
+                return candidate.resolve()
+    more = f", a package above or beside it, or the folders of {FORMATS['package paths']}" if scheme else ""
+    raise InvalidInputError(f"{path}: {where} refers to the mesh {uri!r}, which does not exist in {path.parent}{more}")
+
+
+def _places(scheme: str, rest: Path, folder: Path) -> Iterator[Path]:
+    """Files that a URI of this scheme and path may name, in the order of the search."""
+    yield rest if scheme == "file" else folder / rest
+    paths = [os.environ.get(name, "") for name in FORMATS["package paths"].split()] if scheme else []
+    roots = [Path(root) for path in paths for root in path.split(os.pathsep) if root]
+    roots += [root / "share" for root in roots]  # a prefix of ROS 2
+    yield from (root / rest for root in roots)
+    if scheme not in ("package", "model"):
+        return
+    package, inside = rest.parts[0] if rest.parts else "", Path(*rest.parts[1:])
+    above = (folder, *folder.parents)
+    yield from (parent / inside if parent.name == package else parent / rest for parent in above)
+    yield from (root / inside for root in roots if root.name == package)
+    for parent in (*above, *roots):
+        for manifest in (parent / "package.xml", *sorted(parent.glob("*/package.xml"))):
+            with suppress(OSError, SceneEnvsError):
+                if (read_xml(manifest).findtext("name") or "").strip() == package:
+                    yield manifest.parent / inside
+    yield folder / inside

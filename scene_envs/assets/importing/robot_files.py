@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -10,62 +14,138 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
 from scene_envs.assets.importing.mesh_files import (
+    FORMATS,
     Color,
-    Inertial,
     Model,
     Shape,
     color_of,
     find_mesh,
     from_roll_pitch_yaw,
+    heavier,
+    merged_inertial,
     moved_inertial,
     numbers,
     pose_of,
     positive,
     read_xml,
 )
+from scene_envs.assets.importing.solids import solid_of
+from scene_envs.assets.shapes import MassProperties
 from scene_envs.errors import CorruptFileError, InvalidInputError
 
-_RADII = {"cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sphere": ("radius",)}
+_Colors = Mapping[str, Color | None]
 _ZERO = (0.0, 0.0, 0.0)
+_TO_WORLD = "a joint holds it at `world`"
+
+
+def _unread(root: Element, kind: str) -> list[str]:
+    """A note that names the elements and attributes that are neither read nor left out on purpose, if any."""
+    left_out = " ".join(FORMATS[kind]["left out"].values()).split()
+    found: Counter[str] = Counter()
+
+    def visit(element: Element) -> None:
+        read = FORMATS[kind]["read"].get(element.tag, "").split()
+        names = [f"@{key}" for key in element.attrib if key.partition(":")[0] != "xmlns"]
+        for name, count in Counter([*names, *(child.tag for child in element)]).items():
+            place = f"{element.tag}/{name}"
+            if name not in read and f"{name}*" not in read and place not in left_out:
+                found[place] += count
+            elif name in read and count > 1:
+                found[f"second {place}"] += count - 1
+        found["second geometry"] += len(element) - 1 if element.tag == "geometry" and len(element) else 0
+        for child in element:
+            if child.tag in read or f"{child.tag}*" in read:
+                visit(child)
+
+    visit(root)
+    names = [name + (f" ({count} times)" if count > 1 else "") for name, count in found.items() if count]
+    return [f"not read: {', '.join(names)}"] if names else []
+
+
+def _links(model: Element, path: Path) -> dict[str, Element]:
+    """Links by name; CorruptFileError for none, and for two of one name, of which one would be lost."""
+    elements = model.findall("link")
+    if not elements:
+        raise CorruptFileError(f"{path}: {model.tag} {model.get('name')!r} holds no <link>")
+    links = {link.get("name", ""): link for link in elements}
+    if len(links) < len(elements):
+        name = Counter(link.get("name", "") for link in elements).most_common(1)[0][0]
+        raise CorruptFileError(f"{path} holds several links called {name!r}; give each its own name")
+    return links
+
+
+class _Reading:
+    """What was read of the links of a model."""
+
+    def __init__(self, root: Element, kind: str, path: Path) -> None:
+        self.kind, self.path, self.notes = kind, path, _unread(root, kind)
+        self.shapes: dict[str, list[Shape]] = {"visual": [], "collision": []}
+        self.inertials: list[MassProperties] = []
+
+    def add(self, link: Element, place: Callable[[Element, str], Array], materials: _Colors) -> list[Shape]:
+        """Read the shapes of a link, whose poses in the model frame ``place`` gives; returns its collisions."""
+        before = len(self.shapes["collision"])
+        for tag, shapes in self.shapes.items():
+            for index, element in enumerate(link.findall(tag), start=1):
+                where = f"{tag} {index} of link {link.get('name', '')!r}"
+                shape = _shape(element, self.kind, place(element, where), materials, self.path, where)
+                if isinstance(shape, str):
+                    self.notes.append(f"{where} {shape}, which is left out")
+                else:
+                    shapes.append(shape)
+        return self.shapes["collision"][before:]
+
+    def model(self, movable: list[str], welded: str) -> Model:
+        """The model, with the reason why it is welded, "" where it is not."""
+        if movable:
+            self.notes.append(f"movable joints frozen at zero: {', '.join(movable)}")
+        if welded:
+            self.notes.append(f"{welded}: it is welded (`welded: false` makes it free)")
+        visuals, collisions = map(tuple, self.shapes.values())
+        return Model(visuals, collisions, tuple(self.inertials), bool(welded) or None, tuple(self.notes))
 
 
 def read_sdf(path: Path) -> Model:
     """The model in an SDF file, in the model frame; the model's pose in its world is ignored. Raises CorruptFileError
     for a file that is no SDF or contradicts itself, InvalidInputError for several models, an include or a missing mesh.
     """
-    model = _only_model(path)
-    links = {link.get("name", ""): link for link in model.findall("link")}
-    if not links:
-        raise CorruptFileError(f"{path}: model {model.get('name')!r} holds no <link>")
-    frames = _Frames(model, path)
-    visuals: list[Shape] = []
-    collisions: list[Shape] = []
-    inertials: list[Inertial] = []
-    notes: list[str] = []
+    root = read_xml(path)
+    model = _only_model(root, path)
+    links, frames, reading = _links(model, path), _sdf_frames(model, path), _Reading(root, "SDF", path)
     for name, link in links.items():
         pose = frames.pose(name)
-        for tag, shapes in (("visual", visuals), ("collision", collisions)):
-            for index, element in enumerate(link.findall(tag), start=1):
-                where = f"{tag} {index} of link {name!r}"
-                shape = _sdf_shape(element, pose @ frames.local(element, name, where), path, where)
-                if shape is None:
-                    notes.append(f"{where} is an endless plane, which is left out")
-                else:
-                    shapes.append(shape)
-        inertial = link.find("inertial")
-        if inertial is not None:
-            inertials.append(moved_inertial(pose, _sdf_inertial(inertial, path, f"inertial of link {name!r}")))
-    movable = [j.get("name", "?") for j in model.findall("joint") if j.get("type") != "fixed"]
-    if movable:
-        notes.append(f"movable joints frozen at zero: {', '.join(movable)}")
-    static = True if _flag(model.findtext("static")) else None
-    if static:
-        notes.append("the file says static: it is welded (`welded: false` makes it free)")
-    return Model(tuple(visuals), tuple(collisions), tuple(inertials), static, tuple(notes))
+        collisions = reading.add(link, partial(frames.place, name), {})
+        inertial, where = link.find("inertial"), f"inertial of link {name!r}"
+        if inertial is None:
+            continue
+        if not _flag(inertial.get("auto")):
+            moment = 0.0 if inertial.find("inertia") is None else 1.0  # of SDFormat; without any, the shape decides
+            found = _inertial(inertial, path, where, (1.0, moment))
+            reading.inertials.append(moved_inertial(pose @ _pose(inertial.find("pose"), path, where), found))
+        elif collisions:
+            default = _density(inertial, path, where) or 1000.0  # that of SDFormat
+            filled = [heavier(solid_of(shape), shape.density or default) for shape in collisions]
+            merged = merged_inertial(filled)
+            mass = numbers(inertial.findtext("mass"), 1, path, f"mass in {where}", (merged.mass,))[0]
+            reading.inertials.append(heavier(merged, float(mass) / merged.mass))
+    ends = {
+        joint: [(joint.findtext(end) or "").strip() for end in ("parent", "child")]
+        for joint in [*model.findall("joint"), *root.findall("world/joint")]
+    }
+    for name in {name for joint in model.findall("joint") for name in ends[joint]} - {"world"}:
+        frames.pose(name)
+    movable = [joint.get("name", "?") for joint in ends if joint.get("type") != "fixed"]
+    held = _TO_WORLD if any("world" in names for names in ends.values()) else ""
+    return reading.model(movable, "the file says static" if _flag(model.findtext("static")) else held)
 
 
-def _only_model(path: Path) -> Element:
-    root = read_xml(path)
+def _density(element: Element, path: Path, where: str) -> float | None:
+    """The density (kg/m^3) that a collision or inertial gives, if any."""
+    text = element.findtext("density") or element.findtext("material_density")
+    return positive(text, 1, path, f"density of {where}")[0] if text else None
+
+
+def _only_model(root: Element, path: Path) -> Element:
     if root.tag != "sdf":
         raise CorruptFileError(f"{path} is not an SDF: its root is <{root.tag}>, not <sdf>")
     models = [*root.findall("model"), *root.findall("world/model")]
@@ -87,37 +167,38 @@ def _only_model(path: Path) -> Element:
 
 
 class _Frames:
-    """Poses of links, joints and frames in the model frame, by the rules of SDFormat 1.7 and later."""
+    """Poses of frames in the model frame; each has a base, "" for the model, and a pose (4, 4) in it."""
 
-    def __init__(self, model: Element, path: Path) -> None:
-        self._path = path
-        self._elements: dict[str, tuple[Element, str]] = {}  # element, and the default base of its pose
-        for link in model.findall("link"):
-            self._elements[link.get("name", "")] = link, "__model__"
-        for joint in model.findall("joint"):
-            self._elements.setdefault(joint.get("name", ""), (joint, (joint.findtext("child") or "").strip()))
-        for frame in model.findall("frame"):
-            self._elements.setdefault(frame.get("name", ""), (frame, frame.get("attached_to") or "__model__"))
+    def __init__(self, path: Path, places: dict[str, tuple[str, Array]]) -> None:
+        self._path, self._places = path, places
 
     def pose(self, name: str, waiting: tuple[str, ...] = ()) -> Array:
         """(4, 4) of the frame called ``name``."""
         if name in ("__model__", ""):
             return np.eye(4)
-        if name not in self._elements:
-            raise CorruptFileError(f"{self._path}: a pose is relative to {name!r}, which does not exist")
+        if name not in self._places:
+            raise CorruptFileError(f"{self._path}: a pose or a joint refers to {name!r}, which does not exist")
         if name in waiting:
-            raise CorruptFileError(f"{self._path}: the poses of {', '.join(map(repr, waiting))} refer to each other")
-        element, default = self._elements[name]
-        pose = element.find("pose")
-        base = default if pose is None else pose.get("relative_to") or default
-        return self.pose(base, (*waiting, name)) @ _pose(pose, self._path, repr(name))
+            raise CorruptFileError(f"{self._path}: {', '.join(map(repr, waiting))} hang on each other in a loop")
+        base, pose = self._places[name]
+        return self.pose(base, (*waiting, name)) @ pose
 
-    def local(self, element: Element, link: str, where: str) -> Array:
-        """(4, 4) of a visual or collision in its link's frame."""
+    def place(self, link: str, element: Element, where: str) -> Array:
+        """(4, 4) of a visual or collision of a link in the model frame."""
         pose = element.find("pose")
-        local = _pose(pose, self._path, where)
         base = None if pose is None else pose.get("relative_to")
-        return np.linalg.inv(self.pose(link)) @ self.pose(base) @ local if base else local
+        return self.pose(base or link) @ _pose(pose, self._path, where)
+
+
+def _sdf_frames(model: Element, path: Path) -> _Frames:
+    """The frames of links, joints and frames, by the rules of SDFormat 1.7 and later."""
+    places: dict[str, tuple[str, Array]] = {}
+    for element in [element for tag in ("link", "joint", "frame") for element in model.findall(tag)]:
+        name, pose = element.get("name", ""), element.find("pose")
+        base = (element.findtext("child") or "").strip() if element.tag == "joint" else element.get("attached_to", "")
+        base = base if pose is None else pose.get("relative_to") or base
+        places.setdefault(name, (base, _pose(pose, path, repr(name))))
+    return _Frames(path, places)
 
 
 def _pose(element: Element | None, path: Path, where: str) -> Array:
@@ -125,53 +206,77 @@ def _pose(element: Element | None, path: Path, where: str) -> Array:
         return np.eye(4)
     if element.get("rotation_format") == "quat_xyzw":
         values = numbers(element.text, 7, path, f"pose of {where}", (0.0,) * 6 + (1.0,))
-        return pose_of(values[:3], np.asarray(Rotation.from_quat(values[3:]).as_matrix()))
+        return pose_of(values[:3], _from_quaternion(values[3:], path, where))
     values = numbers(element.text, 6, path, f"pose of {where}", (0.0,) * 6)
     angles = np.radians(values[3:]) if _flag(element.get("degrees")) else values[3:]
     return pose_of(values[:3], from_roll_pitch_yaw(angles))
 
 
-def _geometry(element: Element, path: Path, where: str) -> Element:
-    """What stands first in the ``geometry`` of an element."""
+def _from_quaternion(quaternion: Array, path: Path, where: str) -> Array:
+    """(3, 3) rotation of a quaternion (x, y, z, w) of any length above 0."""
+    if not quaternion.any():
+        raise CorruptFileError(f"{path}: the quaternion of {where} is 0; no rotation is `0 0 0 1`")
+    return np.asarray(Rotation.from_quat(quaternion).as_matrix())
+
+
+def _shape(element: Element, form: str, pose: Array, materials: _Colors, path: Path, where: str) -> Shape | str:
+    """The shape of a visual or collision, or why it is none."""
     geometry = element.find("geometry")
-    kinds = [] if geometry is None else [child for child in geometry if isinstance(child.tag, str)]
-    if not kinds:
+    if geometry is None or not len(geometry):
         raise CorruptFileError(f"{path}: {where} has no geometry")
-    return kinds[0]
-
-
-def _sdf_shape(element: Element, pose: Array, path: Path, where: str) -> Shape | None:
-    kind = _geometry(element, path, where)
-    color = color_of(element.findtext("material/diffuse"), path, f"colour of {where}")
-    if kind.tag == "plane":
-        return None
+    kind = geometry[0]
+    known = FORMATS[form]["read"]["geometry"].split()
+    if kind.tag not in known:
+        raise CorruptFileError(f"{path}: {where} is a <{kind.tag}>; known are {', '.join(known)}")
+    if kind.tag in ("plane", "empty"):
+        return "is an endless plane" if kind.tag == "plane" else "is empty"
+    color = _color(element.find("material"), materials, path, where)
     if kind.tag == "mesh":
-        uri = kind.findtext("uri")
+        uri, scale = _text(kind, "filename" if form == "URDF" else "uri"), _text(kind, "scale")
         if not uri:
-            raise CorruptFileError(f"{path}: the mesh of {where} has no <uri>")
-        scale = numbers(kind.findtext("scale"), 3, path, f"mesh scale of {where}", (1.0, 1.0, 1.0))
-        convex = any(child.tag.endswith("declare_convex") for child in kind)
-        return Shape("mesh", tuple(scale.tolist()), pose, where, find_mesh(uri, path, where), color, convex)
-    if kind.tag == "box":
-        return Shape("box", positive(kind.findtext("size"), 3, path, f"box size of {where}"), pose, where, None, color)
-    if kind.tag == "ellipsoid":
-        radii = positive(kind.findtext("radii"), 3, path, f"radii of {where}")
-        return Shape("ellipsoid", radii, pose, where, None, color)
-    if kind.tag in _RADII:
-        size = [positive(kind.findtext(key), 1, path, f"{kind.tag} {key} of {where}")[0] for key in _RADII[kind.tag]]
-        return Shape(kind.tag, tuple(size), pose, where, None, color)  # type: ignore[arg-type]
-    known = "mesh, box, cylinder, sphere, capsule and ellipsoid"
-    raise CorruptFileError(f"{path}: {where} is a <{kind.tag}>; known are {known}")
+            raise CorruptFileError(f"{path}: the mesh of {where} names no file")
+        count = 1 if len((scale or "").split()) == 1 else 3
+        size = np.broadcast_to(numbers(scale, count, path, f"mesh scale of {where}", (1.0, 1.0, 1.0)), 3)
+        convex = kind.find("drake:declare_convex") is not None or kind.get("optimization") == "convex_hull"
+        name = (kind.findtext("submesh/name") or "").strip()
+        part = (name, _flag(kind.findtext("submesh/center"))) if name else None
+        shape = Shape("mesh", tuple(size.tolist()), pose, where, find_mesh(uri, path, where), color, convex, part)
+    else:
+        counts = FORMATS["primitives"][kind.tag]
+        words = " ".join(_text(kind, key) or "" for key in counts).split()
+        if element.tag == "visual" and any(not word.strip("+-0.,") for word in words):  # other readers take it
+            return "has a size of 0"
+        sizes = [positive(_text(kind, k), n, path, f"{kind.tag} {k} of {where}") for k, n in counts.items()]
+        shape = Shape(kind.tag, sum(sizes, ()), pose, where, None, color)  # type: ignore[arg-type]
+    return replace(shape, density=_density(element, path, where))
 
 
-def _sdf_inertial(element: Element, path: Path, where: str) -> Inertial:
-    mass = numbers(element.findtext("mass"), 1, path, f"mass in {where}", (1.0,))[0]  # the default of SDFormat
-    xx, yy, zz, xy, xz, yz = (
-        numbers(element.findtext(f"inertia/{key}"), 1, path, f"{key} in {where}", (default,))[0]
-        for key, default in (("ixx", 1.0), ("iyy", 1.0), ("izz", 1.0), ("ixy", 0.0), ("ixz", 0.0), ("iyz", 0.0))
-    )
-    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return moved_inertial(_pose(element.find("pose"), path, where), Inertial(float(mass), np.zeros(3), matrix))
+def _text(element: Element | None, key: str) -> str | None:
+    """An attribute of a URDF or the text of a child in an SDF."""
+    return None if element is None else element.get(key) or element.findtext(key)
+
+
+def _color(material: Element | None, known: _Colors, path: Path, where: str) -> Color | None:
+    """The colour of a material, its own or that of its name."""
+    if material is None:
+        return None
+    color = material.find("color")
+    text = material.findtext("diffuse") if color is None else color.get("rgba")
+    return color_of(text, path, f"colour of {where}") or known.get(material.get("name", ""))
+
+
+def _inertial(element: Element, path: Path, where: str, default: tuple[float, float]) -> MassProperties:
+    """The inertial in its own frame; ``default`` has the mass (kg) and the moments (kg m^2) where they are missing."""
+    mass = element.find("mass")
+    text = None if mass is None else mass.get("value", mass.text)
+    kilograms = numbers(text, 1, path, f"mass in {where}", default[:1])[0]
+    matrix = np.zeros((3, 3))
+    for row, column in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
+        key = f"i{'xyz'[row]}{'xyz'[column]}"
+        missing = (default[1] * (row == column),)
+        value = numbers(_text(element.find("inertia"), key), 1, path, f"{key} in {where}", missing)[0]
+        matrix[row, column] = matrix[column, row] = value
+    return MassProperties(float(kilograms), np.zeros(3), matrix)
 
 
 def _flag(text: str | None) -> bool:
@@ -185,105 +290,59 @@ def read_urdf(path: Path) -> Model:
     robot = read_xml(path)
     if robot.tag != "robot":
         raise CorruptFileError(f"{path} is not a URDF: its root is <{robot.tag}>, not <robot>")
-    links = {link.get("name", ""): link for link in robot.findall("link")}
-    if not links:
-        raise CorruptFileError(f"{path} holds no <link>")
+    if any(element.tag.startswith("xacro:") for element in robot.iter()):
+        raise CorruptFileError(f"{path} holds <xacro:...> elements; expand it with xacro first")
+    links, reading = _links(robot, path), _Reading(robot, "URDF", path)
+    holding = [j for j in robot.findall("joint") for parent in j.findall("parent") if parent.get("link") == "world"]
+    if holding:  # a link that need not be declared
+        links.setdefault("world", Element("link", name="world"))
     poses, movable = _link_poses(robot, links, path)
-    materials = {m.get("name", ""): _own_color(m, path) for m in robot.findall("material")}
-    for link in links.values():  # a material may be defined inside any visual
-        for material in link.findall("visual/material"):
-            if material.find("color") is not None:
-                materials[material.get("name", "")] = _own_color(material, path)
-    visuals: list[Shape] = []
-    collisions: list[Shape] = []
-    inertials = []
+    materials: dict[str, Color | None] = {}
+    for material in [*robot.findall("material"), *robot.findall("link/visual/material")]:
+        if material.find("color") is not None:  # it may be defined inside any visual
+            materials[material.get("name", "")] = _color(material, {}, path, f"material {material.get('name')!r}")
     for name, link in links.items():
-        for tag, shapes, known in (("visual", visuals, materials), ("collision", collisions, {})):
-            for index, element in enumerate(link.findall(tag), start=1):
-                shapes.append(_urdf_shape(element, poses[name], known, path, f"{tag} {index} of link {name!r}"))
-        inertial = link.find("inertial")
-        if inertial is not None:
-            inertials.append(moved_inertial(poses[name], _urdf_inertial(inertial, path, f"inertial of link {name!r}")))
-    notes = [f"movable joints frozen at zero: {', '.join(movable)}"] if movable else []
-    static = True if inertials and all(inertial.mass == 0 for inertial in inertials) else None
-    if static:
-        notes.append("the file gives mass 0: it is welded (`welded: false` makes it free)")
-    return Model(tuple(visuals), tuple(collisions), tuple(inertials), static, tuple(notes))
+        reading.add(link, partial(_placed, path, poses[name]), materials)
+        for inertial in link.findall("inertial")[:1]:
+            where = f"inertial of link {name!r}"
+            pose = _placed(path, poses[name], inertial, where)
+            reading.inertials.append(moved_inertial(pose, _inertial(inertial, path, where, (0.0, 0.0))))
+    massless = reading.inertials and all(inertial.mass == 0 for inertial in reading.inertials)
+    held = _TO_WORLD if any(joint.get("type") not in ("floating", "planar") for joint in holding) else ""
+    return reading.model(movable, "the file gives mass 0" if massless else held)
 
 
 def _link_poses(robot: Element, links: dict[str, Element], path: Path) -> tuple[dict[str, Array], list[str]]:
     """(4, 4) of each link in the root link's frame, and the names of movable joints."""
-    parents: dict[str, tuple[str, Array]] = {}
-    movable = []
+    places: dict[str, tuple[str, Array]] = {}
     for joint in robot.findall("joint"):
         name = joint.get("name", "?")
         ends = [element.get("link", "") if (element := joint.find(t)) is not None else "" for t in ("parent", "child")]
         for end in ends:
             if end not in links:
                 raise CorruptFileError(f"{path}: joint {name!r} connects link {end!r}, which does not exist")
-        parent, child = ends
-        if child in parents:
-            raise CorruptFileError(f"{path}: link {child!r} is the child of two joints; a URDF is a tree")
-        parents[child] = (parent, _origin(joint, path, f"joint {name!r}"))
-        if joint.get("type") != "fixed":
-            movable.append(name)
-    roots = [name for name in links if name not in parents]
+        if ends[1] in places:
+            raise CorruptFileError(f"{path}: link {ends[1]!r} is the child of two joints; a URDF is a tree")
+        places[ends[1]] = ends[0], _placed(path, np.eye(4), joint, f"joint {name!r}")
+    roots = [name for name in links if name not in places]
     if len(roots) != 1:
         found = ", ".join(map(repr, roots)) or "none (its joints form a loop)"
         raise CorruptFileError(f"{path}: a URDF has one root link, this one has {found}")
-    poses = {roots[0]: np.eye(4)}
-    while len(poses) < len(links):
-        reached = {child: poses[p] @ pose for child, (p, pose) in parents.items() if p in poses and child not in poses}
-        if not reached:
-            loop = sorted(set(links) - set(poses))
-            raise CorruptFileError(f"{path}: links {', '.join(map(repr, loop))} hang on each other in a loop")
-        poses |= reached
-    return poses, movable
+    frames = _Frames(path, {roots[0]: ("", np.eye(4)), **places})
+    movable = [joint.get("name", "?") for joint in robot.findall("joint") if joint.get("type") != "fixed"]
+    return {name: frames.pose(name) for name in links}, movable
 
 
-def _origin(element: Element, path: Path, where: str) -> Array:
+def _placed(path: Path, base: Array, element: Element, where: str) -> Array:
+    """(4, 4) of the origin of an element in the frame that has the pose ``base``."""
     origin = element.find("origin")
     if origin is None:
-        return np.eye(4)
+        return base
     xyz = numbers(origin.get("xyz"), 3, path, f"origin xyz of {where}", _ZERO)
+    if origin.get("rpy") and origin.get("quat_xyzw"):
+        raise CorruptFileError(f"{path}: the origin of {where} has both rpy and quat_xyzw; keep one of them")
+    if origin.get("quat_xyzw"):
+        quaternion = numbers(origin.get("quat_xyzw"), 4, path, f"origin quat_xyzw of {where}")
+        return base @ pose_of(xyz, _from_quaternion(quaternion, path, where))
     rpy = numbers(origin.get("rpy"), 3, path, f"origin rpy of {where}", _ZERO)
-    return pose_of(xyz, from_roll_pitch_yaw(rpy))
-
-
-def _own_color(material: Element, path: Path) -> Color | None:
-    element = material.find("color")
-    return None if element is None else color_of(element.get("rgba"), path, f"material {material.get('name')!r}")
-
-
-def _urdf_shape(element: Element, link: Array, materials: dict[str, Color | None], path: Path, where: str) -> Shape:
-    pose = link @ _origin(element, path, where)
-    material = element.find("material")
-    color = None if material is None else _own_color(material, path) or materials.get(material.get("name", ""))
-    kind = _geometry(element, path, where)
-    if kind.tag == "mesh":
-        filename = kind.get("filename")
-        if not filename:
-            raise CorruptFileError(f"{path}: the mesh of {where} has no filename")
-        scale = kind.get("scale")
-        count = len((scale or "").split())
-        size = numbers(scale, 1 if count == 1 else 3, path, f"mesh scale of {where}", (1.0, 1.0, 1.0))
-        convex = any(child.tag.endswith("declare_convex") for child in kind)
-        sizes = tuple(np.broadcast_to(size, 3).tolist())
-        return Shape("mesh", sizes, pose, where, find_mesh(filename, path, where), color, convex)
-    if kind.tag == "box":
-        return Shape("box", positive(kind.get("size"), 3, path, f"box size of {where}"), pose, where, None, color)
-    if kind.tag in _RADII:
-        sizes = tuple(positive(kind.get(k), 1, path, f"{kind.tag} {k} of {where}")[0] for k in _RADII[kind.tag])
-        return Shape(kind.tag, sizes, pose, where, None, color)  # type: ignore[arg-type]
-    raise CorruptFileError(f"{path}: {where} is a <{kind.tag}>; known are mesh, box, cylinder, sphere and capsule")
-
-
-def _urdf_inertial(element: Element, path: Path, where: str) -> Inertial:
-    mass_element, tensor = element.find("mass"), element.find("inertia")
-    mass = numbers(None if mass_element is None else mass_element.get("value"), 1, path, f"mass in {where}", (0.0,))[0]
-    xx, yy, zz, xy, xz, yz = (
-        numbers(None if tensor is None else tensor.get(key), 1, path, f"{key} in {where}", (0.0,))[0]
-        for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    )
-    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return moved_inertial(_origin(element, path, where), Inertial(float(mass), np.zeros(3), matrix))
+    return base @ pose_of(xyz, from_roll_pitch_yaw(rpy))

@@ -20,8 +20,16 @@ from scene_envs.arrays import Array
 from scene_envs.assets.base import Asset, ConvexPart
 from scene_envs.assets.fcl import Broadphase, convex, gap
 from scene_envs.assets.importing.limits import seconds_left, too_slow
-from scene_envs.assets.importing.mesh_files import Color, Shape, bare, painted, read_mesh
-from scene_envs.assets.shapes import Profile, box, convex_hull, solid, volume
+from scene_envs.assets.importing.mesh_files import (
+    Color,
+    Shape,
+    bare,
+    merged_inertial,
+    moved_inertial,
+    painted,
+    read_mesh,
+)
+from scene_envs.assets.shapes import MassProperties, Profile, box, convex_hull, mass_properties, solid, volume
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.files import cache_folder, replacing
 from scene_envs.workers import WorkerFailure, run_apart
@@ -45,6 +53,7 @@ _SNAP_DISTANCE = 0.015
 rebuilds surfaces that are not closed on a grid; moving the corners keeps flat faces flat."""
 _MAX_BODIES = 128
 """Largest number of bodies of one mesh that are decomposed one by one."""
+_NOTHING = MassProperties(0.0, np.zeros(3), np.zeros((3, 3)))
 _SEGMENTS = 16
 _CAP = np.radians(15.0)
 """Half angle of the flat faces at the poles of a ball, on which it can stand."""
@@ -125,51 +134,81 @@ def has_volume(points: Array) -> bool:
 
 
 def convex_parts(
-    mesh: trimesh.Trimesh, method: Method, tolerance: float, threshold: float, what: str
-) -> tuple[list[ConvexPart], list[str], list[str]]:
-    """The convex parts of one mesh (m), with notes and warnings; no parts when the mesh spans no volume.
+    surface: trimesh.Trimesh, method: Method, tolerance: float, threshold: float, what: str
+) -> tuple[list[ConvexPart], MassProperties, list[str], list[str]]:
+    """The convex parts of one bare mesh (m), its solid at 1 kg/m^3, notes and warnings; none without volume.
 
     Closed bodies are taken one by one: those whose depth below their hull is at most ``tolerance`` (m) keep their
-    shape, concave ones are decomposed. A surface that is not closed is decomposed as a whole. ``threshold`` is CoACD's
-    concavity, relative to the size of the body. ``"convex"`` takes one hull of the whole mesh; ``"coacd"`` raises
-    MissingDependencyError where a concave body needs CoACD, and ``"auto"`` then takes a hull.
+    shape, concave ones are decomposed. An open surface is decomposed as a whole, and its parts are its solid.
+    ``threshold`` is CoACD's concavity, relative to the size of the body. ``"convex"`` takes one hull of the whole mesh;
+    ``"coacd"`` raises MissingDependencyError where a concave body needs CoACD, and ``"auto"`` then takes a hull.
     """
-    surface = bare(mesh)
     if not len(surface.faces) or not has_volume(np.asarray(surface.vertices)):
-        return [], [f"{what} is flat and left out of the collision parts"], []
-    if method == "convex":
-        return [_hull(surface.vertices, tolerance)], [], []
-    bodies, dropped = _bodies(surface, tolerance)
-    notes = [f"{what}: {dropped} flat piece(s) left out of the collision parts"] if dropped else []
+        return [], _NOTHING, [f"{what} is flat and left out of the collision parts"], []
+    notes: list[str] = []
     warnings: list[str] = []
     parts: list[ConvexPart] = []
+    pieces: list[Any] = list(surface.split(only_watertight=False))
+    thick = [piece for piece in pieces if has_volume(np.asarray(piece.vertices))]
+    closed = _closed(thick)
+    bodies = [body for body in closed if body.volume > 0] or thick
+    if method == "convex":
+        parts, bodies = [_hull(surface.vertices, tolerance)], []
+    elif not 0 < len(bodies) <= _MAX_BODIES or any(
+        not piece.is_watertight and _depth(piece, _hull(piece.vertices, tolerance)) > tolerance for piece in bodies
+    ):
+        bodies = [surface]
+    elif len(pieces) > len(thick):
+        notes = [f"{what}: {len(pieces) - len(thick)} flat piece(s) left out of the collision parts"]
     for body in bodies:
         seconds_left()
         hull = _hull(body.vertices, tolerance)
         if _depth(body, hull) <= tolerance:
             parts.append(hull)
             continue
-        pieces = _decompose(body, method, threshold, what)
-        if pieces is None:
+        cut = _decompose(body, method, threshold, what)
+        if cut is None:
             warnings = [
                 f"{what} is concave and is taken as its hull, because CoACD is not installed "
                 "(`pip install 'scene-envs[decomposition]'`)"
             ]
-        parts += [hull] if pieces is None else [_hull(piece, tolerance) for piece in pieces]
-    return parts, notes, warnings
+        parts += [hull] if cut is None else [_hull(piece, tolerance) for piece in cut]
+    solid = closed or parts
+    return parts, mass_properties(solid, volume(solid)), notes, warnings
 
 
-def _bodies(surface: trimesh.Trimesh, tolerance: float) -> tuple[list[trimesh.Trimesh], int]:
-    """Closed or convex bodies of a surface and the number of flat pieces; else the whole surface as one body."""
-    pieces: list[Any] = list(surface.split(only_watertight=False))
-    solid = [piece for piece in pieces if has_volume(np.asarray(piece.vertices))]
-    if not solid or len(solid) > _MAX_BODIES:
-        return [surface], 0
-    for piece in solid:
-        closed = piece.is_watertight and piece.volume > 0
-        if not closed and _depth(piece, _hull(piece.vertices, tolerance)) > tolerance:
-            return [surface], 0
-    return solid, len(pieces) - len(solid)
+def _closed(pieces: Sequence[Any]) -> list[Any]:
+    """The bodies of a closed surface, the outermost ones facing outward, whatever way the file turns them, and what is
+    inside them turned with them, so that cavities face inward; none where a piece is open or covers more than its hull.
+    """
+    from trimesh.repair import fix_winding
+
+    for piece in pieces:
+        seconds_left()
+        if piece.is_watertight and not piece.is_winding_consistent:
+            fix_winding(piece)
+        if not piece.is_watertight or not 0 < abs(piece.volume) <= ConvexHull(piece.vertices).volume * (1 + 1e-6):
+            return []
+    bodies = sorted(pieces, key=lambda piece: -abs(piece.volume))
+    bounds = np.array([body.bounds for body in bodies]).reshape(-1, 2, 3)
+    inward = [body.volume < 0 for body in bodies]
+    for at, body in enumerate(bodies):
+        seconds_left()
+        inside = ((bounds[:at, 0] <= bounds[at, 0]) & (bounds[:at, 1] >= bounds[at, 1])).all(axis=1)
+        outer = next((index for index in np.flatnonzero(inside) if _holds(bodies[index], body)), at)
+        if inward[outer]:
+            body.invert()
+    return bodies
+
+
+def _holds(outer: trimesh.Trimesh, inner: trimesh.Trimesh) -> bool:
+    """Whether a closed body encloses four corners of another, by their solid angles (van Oosterom and Strackee)."""
+    points = np.asarray(inner.vertices)[:: max(1, len(inner.vertices) // 4)][:4]
+    a, b, c = np.moveaxis(np.asarray(outer.triangles)[None] - points[:, None, None], 2, 0)  # each (P, F, 3)
+    la, lb, lc = (np.linalg.norm(corner, axis=-1) for corner in (a, b, c))
+    dots = (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+    turns = np.arctan2((a * np.cross(b, c)).sum(-1), la * lb * lc + dots).sum(axis=1) / (2 * np.pi)
+    return bool((np.abs(turns) > 0.5).all())
 
 
 def _hull(points: Array, tolerance: float) -> ConvexPart:
@@ -304,10 +343,10 @@ def _write(path: Path, pieces: Sequence[Array]) -> None:
 
 
 class Collision(NamedTuple):
-    """Convex parts of one shape, the volume it fills (m^3), and remarks for the report."""
+    """Convex parts of one shape, the solid it fills at 1 kg/m^3, and remarks for the report."""
 
     parts: list[ConvexPart]
-    volume: float
+    solid: MassProperties
     notes: list[str]
     warnings: list[str]
 
@@ -317,13 +356,24 @@ def _file(path: Path, changed: int) -> tuple[trimesh.Trimesh, ...]:
     return tuple(read_mesh(path))
 
 
+@lru_cache(maxsize=32)
 def meshes_of(shape: Shape) -> list[trimesh.Trimesh]:
-    """The meshes of a mesh shape in the model frame, colours kept; raises like :func:`read_mesh`."""
+    """The meshes of a mesh shape in the model frame, colours kept, not to be changed; raises like :func:`read_mesh`,
+    and InvalidInputError for an object that its file does not hold.
+    """
     assert shape.path is not None
-    changed = shape.path.stat().st_mtime_ns if shape.path.is_file() else 0
-    meshes: list[Any] = [mesh.copy() for mesh in _file(shape.path, changed)]
+    found = _file(shape.path, shape.path.stat().st_mtime_ns if shape.path.is_file() else 0)
+    meshes: list[Any] = [m.copy() for m in found if shape.part is None or shape.part[0] in m.metadata["names"]]
+    if shape.part is not None and not meshes:
+        known = ", ".join(sorted({repr(name) for mesh in found for name in mesh.metadata["names"]}))
+        raise InvalidInputError(
+            f"{shape.path} holds no object {shape.part[0]!r}, the submesh of {shape.where}; {known}"
+        )
+    bounds = np.array([mesh.bounds for mesh in meshes])
+    middle = 0.5 * (bounds[:, 0].min(axis=0) + bounds[:, 1].max(axis=0)) * bool(shape.part and shape.part[1])
     for mesh in meshes:
-        mesh.vertices = (np.asarray(mesh.vertices) * shape.size) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+        moved = (np.asarray(mesh.vertices) - middle) * shape.size
+        mesh.vertices = moved @ shape.pose[:3, :3].T + shape.pose[:3, 3]
         if np.prod(shape.size) < 0:  # a mirror turns triangles inside out
             colors = mesh.visual.face_colors if mesh.visual.kind == "face" else None
             mesh.faces = np.asarray(mesh.faces)[:, ::-1]
@@ -362,20 +412,50 @@ def collision_of(shape: Shape, method: Method, tolerance: float, threshold: floa
     if shape.kind != "mesh":
         part = _primitive(shape)
         part = ConvexPart(part.vertices @ shape.pose[:3, :3].T + shape.pose[:3, 3], part.faces)
-        return Collision([part], volume([part]), [], [])
+        return Collision([part], solid_of(shape), [], [])
     assert shape.path is not None
-    result = Collision([], 0.0, [], [])
-    filled = 0.0
-    for mesh in meshes_of(shape):
+    result = Collision([], _NOTHING, [], [])
+    solids = []
+    for surface in _surfaces(shape):
         how: Method = "convex" if shape.is_convex else method
-        parts, notes, warnings = convex_parts(mesh, how, tolerance, threshold, f"{shape.path.name} ({shape.where})")
-        surface = bare(mesh)
-        hulls = volume(parts)
-        filled += min(hulls, float(surface.volume)) if surface.is_watertight and surface.volume > 0 else hulls
+        parts, solid, *remarks = convex_parts(surface, how, tolerance, threshold, f"{shape.path.name} ({shape.where})")
+        solids.append(solid)
         result.parts.extend(parts)
-        result.notes.extend(note for note in notes if note not in result.notes)
-        result.warnings.extend(warning for warning in warnings if warning not in result.warnings)
-    return result._replace(volume=filled)
+        for kept, new in zip(result[2:], remarks, strict=True):
+            kept.extend(remark for remark in new if remark not in kept)
+    return result._replace(solid=merged_inertial(solids))
+
+
+def _surfaces(shape: Shape) -> list[trimesh.Trimesh]:
+    """The bare meshes of a shape; one, where they are closed only together, as those of one body by material are."""
+    import trimesh
+
+    apart: list[Any] = [bare(mesh) for mesh in meshes_of(shape)]
+    if all(mesh.is_watertight for mesh in apart):
+        return apart
+    whole = bare(trimesh.util.concatenate(apart))  # type: ignore[arg-type]
+    return [whole] if whole.is_watertight else apart
+
+
+def solid_of(shape: Shape) -> MassProperties:
+    """The solid of a shape at 1 kg/m^3, in closed form for primitives; InvalidInputError for a mesh that is open."""
+    if shape.kind == "mesh":
+        bodies = _closed([piece for mesh in _surfaces(shape) for piece in mesh.split(only_watertight=False)])
+        if not bodies:
+            raise InvalidInputError(f"{shape.path}: {shape.where} has no mass, as it is not closed; give a mass")
+        return mass_properties(bodies, volume(bodies))
+    if shape.kind in ("cylinder", "capsule"):
+        radius, length = shape.size
+        rod, ball = np.pi * radius**2 * length, 4.0 / 3.0 * np.pi * radius**3 * (shape.kind == "capsule")
+        mass, side = rod + ball, radius**2 * (rod / 4.0 + ball / 5.0)
+        along = rod * length**2 / 12.0 + ball * (radius**2 / 5.0 + length**2 / 4.0 + 0.375 * length * radius)
+        squares = np.array([side, side, along])
+    else:
+        size = np.broadcast_to(shape.size, 3)
+        filled, share = (1.0, 12.0) if shape.kind == "box" else (4.0 / 3.0 * np.pi, 5.0)
+        mass = filled * float(size.prod())
+        squares = mass * size**2 / share
+    return moved_inertial(shape.pose, MassProperties(mass, np.zeros(3), np.diag(squares.sum() - squares)))
 
 
 def _primitive(shape: Shape) -> ConvexPart:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import os
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from xml.etree import ElementTree
 
 from scene_envs.assets.base import Asset, AssetLibrary
 from scene_envs.assets.importing.build import (
@@ -26,13 +26,12 @@ from scene_envs.assets.importing.build import (
 from scene_envs.assets.importing.limits import (
     READ_HERE,
     LargeImportError,
-    check_file,
     in_time,
     seconds_left,
     timed,
     too_slow,
 )
-from scene_envs.assets.importing.mesh_files import Color
+from scene_envs.assets.importing.mesh_files import Color, find_mesh, read_xml
 from scene_envs.assets.importing.solids import audit_parts
 from scene_envs.assets.recipes import RECIPES
 from scene_envs.errors import InvalidInputError, SceneEnvsError
@@ -137,7 +136,7 @@ def _listed(path: Path, stamp: tuple[int, int]) -> FolderIndex:
 def _unlisted(folder: Path, stamp: tuple[int, int]) -> FolderIndex:
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
     used = {mesh for path in files if path.suffix.lower() in _DESCRIPTIONS for mesh in _named_files(path)}
-    entries = [default_entry(str(path.relative_to(folder))) for path in files if path.name not in used]
+    entries = [default_entry(str(path.relative_to(folder))) for path in files if path.resolve() not in used]
     if not entries:
         raise InvalidInputError(f"{folder} holds no {', '.join(SUFFIXES)} files")
     check_names(entries, f"{folder} has no library.yaml, so assets are called after their files")
@@ -146,16 +145,17 @@ def _unlisted(folder: Path, stamp: tuple[int, int]) -> FolderIndex:
     return FolderIndex(folder, _colored(entries), False, (note,))
 
 
-def _named_files(path: Path) -> set[str]:
-    """Names of the meshes that a URDF or SDF uses; empty when it cannot be read."""
+def _named_files(path: Path) -> set[Path]:
+    """The meshes that a URDF or SDF uses; empty when it cannot be read."""
     try:
-        check_file(path)
-        root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, OSError, SceneEnvsError):
+        root = read_xml(path)
+    except SceneEnvsError:
         return set()
-    texts = [element.get("filename") or "" for element in root.iter("mesh")]
-    texts += [element.text or "" for element in root.iter("uri")]
-    return {text.strip().replace("\\", "/").rsplit("/", 1)[-1] for text in texts}
+    found = set()
+    for uri in [mesh.get("filename") or mesh.findtext("uri") or "" for mesh in root.iter("mesh")]:
+        with contextlib.suppress(SceneEnvsError, OSError):
+            found.add(find_mesh(uri, path, "a mesh"))
+    return found
 
 
 def _colored(entries: list[AssetEntry]) -> tuple[AssetEntry, ...]:
