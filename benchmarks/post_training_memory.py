@@ -5,7 +5,8 @@
 Compares the score-function gradient, accumulated step by step (`DDPOSFLoss`), with a gradient that is propagated
 through the whole chain. Every step is in the gradient. Hooks count the tensors that autograd keeps for the backward
 pass, so the figure is exact and the same on every machine. On a GPU the allocator's peak is printed too. The states
-of the chain, which the score function needs, have a column of their own: kilobytes a scene.
+of the chain, which the score function needs, have a column of their own: kilobytes a scene. ``--prior paper`` is the
+untrained network of the paper's recipe, of mixed scenes, for which the gradient through the chain is left out.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from types import TracebackType
 from typing import Any
 from weakref import finalize
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
@@ -26,8 +28,12 @@ from torch import Tensor
 from agents.diffusion.reverse_steps import GaussianStep, gaussian_log_prob
 from agents.post_training import DDPOSFLoss, DenoisingPolicy
 from agents.post_training.policy import gradient_weights
+from agents.pretraining import PretrainConfig
+from agents.pretraining.initial_prior import build_prior
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
+from scene_envs.grammars import get_grammar
+from scene_envs.normalizer import Normalizer
 
 MEBIBYTE = 2**20
 
@@ -136,14 +142,21 @@ def measure(run: Callable[[], None], ignored: list[Tensor]) -> int:
     return saved.peak
 
 
+def _prior(name: str) -> ScenePrior:
+    if name == "paper":
+        raw = get_grammar("dimsum_table").sample(np.random.default_rng(0), 64).tensor
+        return build_prior(PretrainConfig(recipe="paper"), raw, Normalizer.fit(raw))
+    return tiny_prior() if name == "tiny" else ScenePrior.load(name)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--prior", default="dimsum_table_continuous", help="name, directory, or 'tiny'")
+    parser.add_argument("--prior", default="dimsum_table_continuous", help="name, directory, 'tiny' or 'paper'")
     parser.add_argument("--batch-size", type=int, default=8)
     parser.add_argument("--steps", type=int, nargs="+", default=[10, 25, 50, 100])
     arguments = parser.parse_args()
-    prior = tiny_prior() if arguments.prior == "tiny" else ScenePrior.load(arguments.prior)
+    prior = _prior(arguments.prior)
     batch = arguments.batch_size
     weights = [p.detach() for p in prior.parameters()]
     rows = []
@@ -152,7 +165,8 @@ def main() -> None:
         state_bytes = sum(t.numel() * t.element_size() for t in states)
         kept = measure(ours, weights + states)
         prior.zero_grad()
-        rows.append(Row(steps, kept, measure(through_chain(prior, steps, batch), weights), state_bytes))
+        mixed = arguments.prior == "paper"
+        rows.append(Row(steps, kept, 0 if mixed else measure(through_chain(prior, steps, batch), weights), state_bytes))
         prior.zero_grad()
     table = Table(title=f"Kept for the backward pass, {batch} scenes, MiB")
     for head in ("steps", "score function", "through the chain", "ratio", "states of the chain"):
@@ -160,7 +174,8 @@ def main() -> None:
     for row in rows:
         figures = (f"{n / MEBIBYTE:.1f}" for n in (row.score_function, row.through_chain, row.states))
         own, chain, kept_states = figures
-        table.add_row(str(row.steps), own, chain, f"{row.through_chain / row.score_function:.0f}x", kept_states)
+        chain, ratio = (chain, f"{row.through_chain / row.score_function:.0f}x") if row.through_chain else ("", "")
+        table.add_row(str(row.steps), own, chain, ratio, kept_states)
     Console().print(table)
 
 

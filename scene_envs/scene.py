@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_envs.arrays import Array, Index
+from scene_envs.arrays import Array, Index, constant_on
 from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
 from scene_envs.files import read_tensors, write_tensors
 from scene_envs.normalizer import Normalizer
@@ -150,8 +150,7 @@ class SceneBatch:
     @property
     def is_welded(self) -> Tensor:
         """(B, N) bool: slots that hold welded assets."""
-        welded = torch.tensor(self.scene_type.welded_categories, device=self._tensor.device, dtype=torch.long)
-        return torch.isin(self.categories, welded)
+        return constant_on(welded_mask(self.scene_type), self._tensor.device)[self.categories]
 
     @property
     def is_free(self) -> Tensor:
@@ -235,15 +234,15 @@ class SceneBatch:
         """
         from scene_envs.supports import Contacts, Placed
 
-        supports = torch.full(self.categories.shape, -1, dtype=torch.int64)
+        supports = torch.full_like(self.categories, -1)
         for start in range(0, len(supports), _CHUNK):
             rows = slice(start, start + _CHUNK)
             poses = self.translations[rows], self.rotations[rows]
-            shapes, placed, slot = Placed.of_scenes(self.scene_type, self.categories[rows], *poses)
-            below = Contacts.of(shapes, placed).holding().support
-            held = below >= 0
-            supports[rows][placed.scene[held], slot[held]] = torch.from_numpy(slot[below[held]])
-        return supports.to(self.translations.device)
+            shapes, placed = Placed.of_scenes(self.scene_type, self.categories[rows], *poses)
+            supports[rows][placed.scene, placed.slot] = (
+                Contacts.of(shapes, placed).holding().counted(placed.slot).support
+            )
+        return supports
 
     def is_any_of(self, *names: str) -> Tensor:
         """(B, N) bool: slots that hold one of the named assets.
@@ -367,6 +366,14 @@ def require_rigid_poses(batch: SceneBatch) -> None:
                 f"scene {scene}, slot {slot} holds {what}: {batch.tensor[scene, slot, POSE].tolist()}; "
                 "SceneBatch.from_tensor turns the output of a sampler into valid poses"
             )
+
+
+@lru_cache(maxsize=32)
+def welded_mask(scene_type: SceneType) -> Tensor:
+    """(C + 1,) bool: assets that are welded, and False for empty slots."""
+    welded = torch.zeros(scene_type.num_assets + 1, dtype=torch.bool)
+    welded[list(scene_type.welded_categories)] = True
+    return welded
 
 
 def _require_scene_tensor(tensor: Tensor, scene_type: SceneType) -> None:

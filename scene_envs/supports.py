@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
-import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from scene_envs.arrays import Array, Index, Mask
+from scene_envs.arrays import constant_on
 from scene_envs.assets.support_shapes import LibraryShapes, library_shapes
+from scene_envs.scene import welded_mask
 from scene_envs.scene_types import SceneType
 
 CONTACT = 0.01
@@ -21,67 +25,76 @@ _UPRIGHT = 0.85
 """Cosine of the tilt up to which an object carries others."""
 _STEEPNESS = 20.0
 """Weight of height in the choice of foot points: 1/20 m more height cancels 1 m more distance outward."""
-_DIRECTIONS = np.stack([np.cos(np.arange(8) * np.pi / 4.0), np.sin(np.arange(8) * np.pi / 4.0)], axis=1)  # (8, 2)
+Column = TypeVar("Column", Tensor, NDArray[Any])
+_ANGLES = torch.arange(8, dtype=torch.float64) * math.pi / 4.0
+_DIRECTIONS = torch.stack([_ANGLES.cos(), _ANGLES.sin()], dim=1)  # (8, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """n objects of several scenes, one after the other."""
+    """n objects of several scenes, one after the other, on the device of the scenes."""
 
-    scene: Index  # (n,) index of the scene, ascending
-    category: Index  # (n,) index of the asset
-    rotation: Array  # (n, 3, 3) rotation from the asset frame to the world
-    translation: Array  # (n, 3) position of the asset frame, m
-    center: Array  # (n, 3) centre of mass, world frame, m
-    points: Array  # (n, 3, V) extreme points, world frame, m
-    feet: Array  # (n, 9, 3) eight low points all round and their mean, m
-    fixed: Mask  # (n,) bool, static or welded
+    shape: torch.Size  # scenes, and their slots
+    scene: Tensor  # (n,) index of the scene, ascending
+    slot: Tensor  # (n,) slot in the scene, ascending within each
+    category: Tensor  # (n,) index of the asset
+    rotation: Tensor  # (n, 3, 3) rotation from the asset frame to the world
+    translation: Tensor  # (n, 3) position of the asset frame, m
+    center: Tensor  # (n, 3) centre of mass, world frame, m
+    points: Tensor  # (n, 3, V) extreme points, world frame, m
+    feet: Tensor  # (n, 9, 3) eight low points all round and their mean, m
+    fixed: Tensor  # (n,) bool, static or welded
 
     @classmethod
     def of_scenes(
         cls, scene_type: SceneType, categories: Tensor, translations: Tensor, rotations: Tensor
-    ) -> tuple[LibraryShapes, Placed, Index]:
-        """The shapes of the assets, the objects of B scenes, and the slot of each object, from categories (B, N),
-        translations (B, N, 3) m and rotations (B, N, 3, 3).
+    ) -> tuple[LibraryShapes, Placed]:
+        """The shapes of the assets and the objects of B scenes, from categories (B, N), translations (B, N, 3) m and
+        rotations (B, N, 3, 3).
         """
-        shapes = library_shapes(scene_type.library)
-        scene, slot = np.nonzero((categories != scene_type.num_assets).cpu().numpy())
-        category = categories.cpu().numpy()[scene, slot]
-        translation, rotation = (poses.double().cpu().numpy()[scene, slot] for poses in (translations, rotations))
+        shapes = library_shapes(scene_type.library, translations.device)
+        scene, slot = torch.nonzero(categories != scene_type.num_assets, as_tuple=True)
+        category = categories[scene, slot]
+        translation, rotation = (poses[scene, slot].double() for poses in (translations, rotations))
         points = rotation @ shapes.points[category] + translation[..., None]
-        center = np.einsum("nij,nj->ni", rotation, shapes.center[category]) + translation
-        height = points[:, 2] - points[:, 2].min(axis=-1, keepdims=True)
-        outward = _DIRECTIONS @ points[:, :2] - _STEEPNESS * height[:, None]  # (n, 8, V)
-        feet = np.take_along_axis(points, outward.argmax(axis=-1)[:, None], axis=-1).swapaxes(1, 2)
-        feet = np.concatenate([feet, feet.mean(axis=1, keepdims=True)], axis=1)
-        fixed = shapes.static[category] | np.isin(category, scene_type.welded_categories)
-        return shapes, cls(scene, category, rotation, translation, center, points, feet, fixed), slot
+        center = (rotation @ shapes.center[category][..., None])[..., 0] + translation
+        height = points[:, 2] - points[:, 2].amin(dim=-1, keepdim=True)
+        outward = constant_on(_DIRECTIONS, points.device) @ points[:, :2] - _STEEPNESS * height[:, None]  # (n, 8, V)
+        feet = points.gather(2, outward.argmax(dim=-1)[:, None].expand(-1, 3, -1)).mT
+        feet = torch.cat([feet, feet.mean(dim=1, keepdim=True)], dim=1)
+        fixed = shapes.static[category] | constant_on(welded_mask(scene_type), points.device)[category]
+        return shapes, cls(categories.shape, scene, slot, category, rotation, translation, center, points, feet, fixed)
+
+    def padded(self, values: Tensor, blank: float = 0) -> Tensor:
+        """``values`` (n, ...) of the objects in their slots, (B, N, ...); others hold ``blank``, or -1 of integers."""
+        blank = -1 if values.dtype == torch.int64 else blank
+        return values.new_full((*self.shape, *values.shape[1:]), blank).index_put((self.scene, self.slot), values)
+
+    def carried(self, support: Tensor) -> Tensor:
+        """(B, N, N) bool: [i, j] whether object j is i, or is held by i, directly or not; ``support`` (n,) is slots."""
+        carried = torch.eye(self.shape[1], dtype=torch.bool, device=support.device).repeat(self.shape[0], 1, 1)
+        scene, upper, lower, below = self.scene, self.slot, support, self.padded(support)
+        while len(held := torch.nonzero(lower >= 0)[:, 0]):
+            scene, upper, lower = scene[held], upper[held], lower[held]
+            carried[scene, lower, upper] = True
+            lower = below[scene, lower]
+        return carried
 
 
 @dataclass(frozen=True, eq=False)
-class Holding:
+class Holding(Generic[Column]):
     """Supports of n objects; indices are into the same n."""
 
-    support: Index  # (n,) object that each object stands on or lies in; -1 for none
-    contained: Mask  # (n,) bool; True where the object lies in its support
-    inside: Index  # (n,) innermost container with the object in it or on top of its contents; -1 for none
-    place: Index  # (n,) first fixed object down the chain of supports; -1 for none
-    tier: Index  # (n,) tier of ``place``, counted from the top; -1 where ``place`` has none
+    support: Column  # (n,) object that each object stands on or lies in; -1 for none
+    contained: Column  # (n,) bool; True where the object lies in its support
+    inside: Column  # (n,) innermost container with the object in it or on top of its contents; -1 for none
+    place: Column  # (n,) first fixed object down the chain of supports; -1 for none
+    tier: Column  # (n,) tier of ``place``, counted from the top; -1 where ``place`` has none
 
-    def part(self, rows: slice) -> Holding:
-        """Supports of the objects of ``rows``, which are whole scenes; indices count from their first object."""
-        pointers = (np.maximum(column[rows] - rows.start, -1) for column in (self.support, self.inside, self.place))
-        support, inside, place = pointers
-        return Holding(support, self.contained[rows], inside, place, self.tier[rows])
-
-    def carries(self) -> Mask:
-        """(n, n) bool: whether each object carries each other one, directly or through others."""
-        found = np.zeros((len(self.support), len(self.support)), dtype=bool)
-        below, upper = self.support, np.arange(len(self.support))
-        while len(upper := upper[below[upper] >= 0]):
-            found[below[upper], upper] = True
-            below = np.where(below >= 0, self.support[below], -1)
-        return found
+    def counted(self: Holding[Tensor], numbers: Tensor) -> Holding[Tensor]:
+        """The same with other indices: those of the objects are ``numbers`` (n,), such as their slots."""
+        numbers = torch.cat([numbers, numbers.new_full((1,), -1)])  # index -1 stays
+        return Holding(numbers[self.support], self.contained, numbers[self.inside], numbers[self.place], self.tier)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +103,13 @@ class Contacts:
 
     shapes: LibraryShapes
     objects: Placed
-    upper: Index
-    lower: Index
-    gap: Array  # (M, 9) height of the feet above the upper side of the lower object
-    tier: Index  # (M,) nearest tier from the top, -1 where there are none
-    over: Mask  # (M,) the centre of mass is above the lower object
-    above_rim: Array  # (M,) height of the mean foot above the rim of a container; inf where there is none
-    above_well: Array  # (M,) height of the mean foot above the container's inside
+    upper: Tensor
+    lower: Tensor
+    gap: Tensor  # (M, 9) height of the feet above the upper side of the lower object
+    tier: Tensor  # (M,) nearest tier from the top, -1 where there are none
+    over: Tensor  # (M,) bool, the centre of mass is above the lower object
+    above_rim: Tensor  # (M,) height of the mean foot above the rim of a container; inf where there is none
+    above_well: Tensor  # (M,) height of the mean foot above the container's inside
 
     @classmethod
     def of(cls, shapes: LibraryShapes, objects: Placed) -> Contacts:
@@ -104,21 +117,17 @@ class Contacts:
         upper, lower = _near_pairs(objects)
         category = objects.category[lower]
 
-        def local(points: Array) -> Array:
-            offset = points - objects.translation[lower].reshape(len(lower), *(1,) * (points.ndim - 2), 3)
-            return np.einsum("m...i,mij->m...j", offset, objects.rotation[lower])
+        def local(points: Tensor) -> Tensor:
+            return (points - objects.translation[lower, None]) @ objects.rotation[lower]
 
-        feet, center = local(objects.feet[upper]), local(objects.center[upper])
-        many = np.broadcast_to(category[:, None], feet.shape[:2])
-        gap = feet[..., 2] - shapes.wide[shapes.cells(many, feet)]
-        tier = np.full(len(upper), -1)
-        tiered = np.isfinite(shapes.tiers[category, 0])
-        if tiered.any():
-            levels = feet[tiered, :, 2, None] - shapes.tiers[category[tiered], None, :]  # (T, 9, L)
-            nearest = np.nanargmin(np.abs(levels[:, -1]), axis=-1)
-            tier[tiered] = nearest
-            on_level = np.take_along_axis(levels, nearest[:, None, None], axis=-1)[..., 0]
-            gap[tiered] = np.where(np.isfinite(gap[tiered]), on_level, np.inf)
+        feet, center = local(objects.feet[upper]), local(objects.center[upper, None])[:, 0]
+        gap = feet[..., 2] - shapes.wide[shapes.cells(category[:, None], feet)]
+        tiers = shapes.tiers[category]
+        levels = feet[..., 2, None] - tiers[:, None]  # (M, 9, L)
+        nearest = levels[:, -1].abs().nan_to_num(torch.inf).argmin(dim=-1)
+        on_level = levels.gather(2, nearest[:, None, None].expand(-1, levels.shape[1], 1))[..., 0]
+        tiered = torch.isfinite(tiers[:, 0])
+        gap = torch.where(tiered[:, None] & torch.isfinite(gap), on_level, gap)
         inside = shapes.top[shapes.cells(category, feet[:, -1])]
         return cls(
             shapes,
@@ -126,64 +135,61 @@ class Contacts:
             upper,
             lower,
             gap,
-            tier,
+            torch.where(tiered, nearest, -1),
             shapes.covered[shapes.cells(category, center)],
-            np.where(np.isfinite(inside), feet[:, -1, 2] - shapes.rim[category], np.inf),
+            torch.where(torch.isfinite(inside), feet[:, -1, 2] - shapes.rim[category], torch.inf),
             feet[:, -1, 2] - inside,
         )
 
-    def holding(self, tolerance: float = CONTACT) -> Holding:
+    def holding(self, tolerance: float | Tensor = CONTACT) -> Holding[Tensor]:
         """Supports of objects; surfaces touch when their gap or overlap is at most ``tolerance`` (m). Place and tier of
         an object that touches nothing are found with three times the tolerance.
         """
         support, contained, tier = self._lower(tolerance)
         far, _, far_tier = self._lower(_FAR * tolerance)
         loose = support < 0
-        below, tier = np.where(loose, far, support), np.where(loose, far_tier, tier)
-        fixed = np.append(self.objects.fixed, True)  # index -1 ends every chain
-        place, inside, base = below.copy(), np.where(contained, support, -1), np.arange(len(below))
-        while (going := np.flatnonzero(~fixed[place])).size:
+        below, tier = torch.where(loose, far, support), torch.where(loose, far_tier, tier)
+        fixed = torch.cat([self.objects.fixed, torch.ones_like(self.objects.fixed[:1])])  # index -1 ends every chain
+        place, inside = below.clone(), torch.where(contained, support, -1)
+        base = torch.arange(len(below), device=below.device)
+        while len(going := torch.nonzero(~fixed[place])[:, 0]):
             base[going] = place[going]
             climbs = going[inside[going] < 0]
-            inside[climbs] = np.where(contained[place[climbs]], support[place[climbs]], -1)
+            inside[climbs] = torch.where(contained[place[climbs]], support[place[climbs]], -1)
             place[going] = below[place[going]]
-        return Holding(support, contained, inside, place, np.where(place >= 0, tier[base], -1))
+        return Holding(support, contained, inside, place, torch.where(place >= 0, tier[base], -1))
 
-    def _lower(self, tolerance: float) -> tuple[Index, Mask, Index]:
+    def _lower(self, tolerance: float | Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The highest object below each object, whether it contains the object, and the tier; (n,) each."""
         size = self.shapes.bounds[self.objects.category[self.lower]]
-        thickness = size[:, 1, 2] - size[:, 0, 2]
-        into = np.minimum(tolerance, 0.5 * thickness)
+        into = (0.5 * (size[:, 1, 2] - size[:, 0, 2])).clamp(max=tolerance)
         touches = (self.gap <= tolerance) & (self.gap >= -into[:, None])  # (M, 9)
         inside = (self.above_rim <= -tolerance) & (self.above_well >= -tolerance)
-        height = np.where(touches, self.objects.feet[self.upper, :, 2] - self.gap, -np.inf).max(axis=1)
-        height = np.where(inside, self.objects.feet[self.upper, -1, 2] - self.above_well, height)
-        held = np.flatnonzero((self.over & touches.any(axis=1)) | inside)
-        held = held[np.argsort(height[held], kind="stable")]  # later, higher ones overwrite
-        count = len(self.objects.category)
-        support, contained, tier = np.full(count, -1), np.zeros(count, dtype=bool), np.full(count, -1)
-        support[self.upper[held]] = self.lower[held]
-        contained[self.upper[held]] = inside[held]
-        tier[self.upper[held]] = self.tier[held]
-        return support, contained, tier
+        feet = self.objects.feet[self.upper, :, 2]
+        height = torch.where(touches, feet - self.gap, -torch.inf).amax(dim=1)
+        height = torch.where(inside, feet[:, -1] - self.above_well, height)
+        height = torch.where((self.over & touches.any(dim=1)) | inside, height, -torch.inf)
+        highest = height.new_full(self.objects.category.shape, -torch.inf).scatter_reduce(0, self.upper, height, "amax")
+        held = (height == highest[self.upper]) & (height > -torch.inf)
+        pair = torch.where(held, torch.arange(len(held), device=held.device), -1)  # of two as high, the last
+        pair = torch.full_like(self.objects.category, -1).scatter_reduce(0, self.upper, pair, "amax")
+        ends = (self.lower, -1), (inside, 0), (self.tier, -1)  # of objects without a pair
+        lower, inside, tier = (torch.cat([side, side.new_full((1,), end)])[pair] for side, end in ends)
+        return lower, inside, tier
 
 
-def _near_pairs(objects: Placed) -> tuple[Index, Index]:
+def _near_pairs(objects: Placed) -> tuple[Tensor, Tensor]:
     """(upper, lower): pairs of one scene whose boxes allow that the first rests on or in the second."""
-    low, high = objects.points.min(axis=-1), objects.points.max(axis=-1)
-    uppers, lowers = [], []
-    starts = np.flatnonzero(np.diff(objects.scene, prepend=-1))
-    for start, stop in zip(starts, np.append(starts[1:], len(objects.scene)), strict=True):
-        a, b = low[start:stop, None], low[None, start:stop]
-        top_a, top_b = high[start:stop, None], high[None, start:stop]
-        near = (a[..., 2] <= top_b[..., 2] + _FAR * LARGEST_CONTACT) & (top_a[..., 2] > b[..., 2])
-        fixed_a, fixed_b = objects.fixed[start:stop, None], objects.fixed[None, start:stop]
-        near &= np.where(fixed_a == fixed_b, a[..., 2] > b[..., 2] + 1e-4, fixed_b)  # so that no chain is a circle
-        near &= (a[..., 0] <= top_b[..., 0]) & (b[..., 0] <= top_a[..., 0])
-        near &= (a[..., 1] <= top_b[..., 1]) & (b[..., 1] <= top_a[..., 1])
-        near &= objects.rotation[None, start:stop, 2, 2] > _UPRIGHT
-        np.fill_diagonal(near, False)
-        first, second = np.nonzero(near)
-        uppers.append(first + start)
-        lowers.append(second + start)
-    return np.concatenate([*uppers, np.empty(0, dtype=np.int64)]), np.concatenate([*lowers, np.empty(0, np.int64)])
+
+    padded = objects.padded
+    low, high = (padded(side, torch.nan) for side in (objects.points.amin(dim=-1), objects.points.amax(dim=-1)))
+    fixed, upright = padded(objects.fixed), padded(objects.rotation[:, 2, 2]) > _UPRIGHT
+    a, b, top_a, top_b = low[:, :, None], low[:, None], high[:, :, None], high[:, None]
+    near = (a[..., 2] <= top_b[..., 2] + _FAR * LARGEST_CONTACT) & (top_a[..., 2] > b[..., 2]) & upright[:, None]
+    below = a[..., 2] > b[..., 2] + 1e-4  # so that no chain is a circle
+    near &= torch.where(fixed[:, :, None] == fixed[:, None], below, fixed[:, None])
+    for axis in (0, 1):
+        near &= (a[..., axis] <= top_b[..., axis]) & (b[..., axis] <= top_a[..., axis])
+    scene, first, second = torch.nonzero(near, as_tuple=True)
+    number = padded(torch.arange(len(objects.scene), device=near.device))
+    return number[scene, first], number[scene, second]

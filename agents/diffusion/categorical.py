@@ -12,6 +12,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -119,8 +121,9 @@ class CategoricalProcess:
     def __init__(self, schedule: CategoricalSchedule, categories: int) -> None:
         self.schedule = schedule
         self.categories = categories
+        self._tables: dict[Any, tuple[Tensor, ...]] = {}
 
-    @property
+    @cached_property
     def only_absorbs(self) -> bool:
         """Whether a category is either unchanged or masked, so that a visible category is the clean one."""
         return not bool(_replaced(self.schedule.keep, self.schedule.mask).any())
@@ -177,18 +180,31 @@ class CategoricalProcess:
         Returns:
             (B, ..., K + 1) probabilities, rows sum to one; differentiable in ``x0_probs``.
         """
+        likelihood, back, kept, spread, mask = self._stride(x_t, t, previous)
+        weight = x0_probs.double() / likelihood
+        weight = weight / weight.sum(dim=-1, keepdim=True).clamp(min=_TINY)
+        states = back * (kept * weight + spread)
+        joint = torch.cat([states, (x_t == self.categories).unsqueeze(-1) * mask], dim=-1)
+        return (joint / joint.sum(dim=-1, keepdim=True).clamp(min=_TINY)).to(x0_probs.dtype)
+
+    def _stride(self, x_t: Tensor, t: Tensor | int, previous: Tensor | int) -> tuple[Tensor, ...]:
+        """q(x_t | x_0), inf where it is 0, q(x_t | x_s), (B, ..., K) each, and keep, spread and mask at s."""
+        if isinstance(t, int) and x_t.ndim > 1:  # once for each state
+            key = t, previous, x_t.device
+            if key not in self._tables:
+                every = torch.arange(self.categories + 1, device=x_t.device)
+                self._tables[key] = self._stride(every, t, previous)
+            likelihood, back, *rates = self._tables[key]
+            return F.embedding(x_t, likelihood), F.embedding(x_t, back), *rates
         keep_s, mask_s = self._rates_at(previous, x_t)
         keep_t, mask_t = self._rates_at(t, x_t)
         keep_ts, mask_ts = (_broadcast(rate, x_t) for rate in self.rates(previous, t, x_t.device))
         k, masked = self.categories, (x_t == self.categories).unsqueeze(-1)
         here = one_hot(x_t, k, torch.float64)
-        likelihood = torch.where(masked, mask_t, keep_t * here + _replaced(keep_t, mask_t) / k)  # q(x_t | x_0)
-        weight = torch.where(likelihood > _TINY, x0_probs.double() / likelihood.clamp(min=_TINY), 0.0)
-        weight = weight / weight.sum(dim=-1, keepdim=True).clamp(min=_TINY)
-        back = torch.where(masked, mask_ts, keep_ts * here + _replaced(keep_ts, mask_ts) / k)  # q(x_t | x_s)
-        states = back * (keep_s * weight + _replaced(keep_s, mask_s) / k)
-        joint = torch.cat([states, masked * mask_s], dim=-1)
-        return (joint / joint.sum(dim=-1, keepdim=True).clamp(min=_TINY)).to(x0_probs.dtype)
+        likelihood = torch.where(masked, mask_t, keep_t * here + _replaced(keep_t, mask_t) / k)
+        back = torch.where(masked, mask_ts, keep_ts * here + _replaced(keep_ts, mask_ts) / k)
+        likelihood = torch.where(likelihood > _TINY, likelihood, torch.inf)
+        return likelihood, back, keep_s, _replaced(keep_s, mask_s) / k, mask_s
 
     def _rates_at(self, t: Tensor | int, like: Tensor) -> tuple[Tensor, Tensor]:
         """Cumulative keep and mask at ``t``, shaped (B, ..., 1) for states ``like`` (B, ...); () for an int."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any
 
 from agents.configuration.composition import build
@@ -17,11 +18,13 @@ from agents.planning.ledger import (
     planner_settings,
     register_planner,
 )
+from scene_envs.arrays import constant_on
 from scene_envs.errors import BELOW_ONE, Count, InvalidInputError, at_least, unknown_name
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from scene_envs.assets import AssetLibrary
     from scene_envs.scene import SceneBatch
 
 WEIGHTS = ("overlap",)
@@ -107,7 +110,8 @@ def overlap(batch: SceneBatch, translations: Tensor) -> Tensor:
     """
     import torch
 
-    radius, low, high = (column[batch.categories.clamp(max=batch.scene_type.num_assets)] for column in _sizes(batch))
+    columns = constant_on(_sizes(batch.scene_type.library), translations.device)
+    radius, low, high = columns[batch.categories.clamp(max=batch.scene_type.num_assets)].unbind(-1)
     flat = translations[..., :2]
     away = (flat[:, :, None] - flat[:, None]).square().sum(-1).clamp(min=1e-12).sqrt()
     across = radius[:, :, None] + radius[:, None] - away
@@ -122,18 +126,18 @@ def overlap(batch: SceneBatch, translations: Tensor) -> Tensor:
     return -0.5 * (1e3 * torch.where(pairs, depth, torch.zeros_like(depth))).square().sum(dim=(1, 2))
 
 
-def _sizes(batch: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
-    """Radius, lowest and highest point of every asset, (C + 1,) m each; 0 for the empty slot."""
+@lru_cache(maxsize=32)
+def _sizes(library: AssetLibrary) -> Tensor:
+    """(C + 1, 3) radius, lowest and highest point of every asset, m; 0 for the empty slot."""
     import torch
 
     from scene_envs.scene import hull_corners
 
     rows = [
-        (corners[:, :2].norm(dim=-1).amax(), corners[:, 2].amin(), corners[:, 2].amax())
-        for corners in hull_corners(batch.scene_type.library)
+        torch.stack([corners[:, :2].norm(dim=-1).amax(), corners[:, 2].amin(), corners[:, 2].amax()]).float()
+        for corners in hull_corners(library)
     ]
-    columns = torch.tensor([*[[float(x) for x in row] for row in rows], [0.0, 0.0, 0.0]], device=batch.tensor.device)
-    return columns[:, 0], columns[:, 1], columns[:, 2]
+    return torch.stack([*rows, torch.zeros(3)])
 
 
 class Guidance:

@@ -13,9 +13,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from agents.diffusion.categorical import one_hot
 from agents.diffusion.gaussian import StepTable
 from agents.diffusion.reverse_steps import MixedStep, ReverseStep, state_of
-from agents.priors.claim_guidance import ClaimGuidance, claims_of
+from agents.priors.claim_guidance import ClaimGuidance, claims_of, names_of
+from scene_envs.arrays import constant_on
 from scene_envs.datasets.prompts.claims import (
     Claim,
     NameCount,
@@ -44,8 +46,9 @@ Start = tuple[int, Tensor]
 Guide = Callable[[int, int, Callable[[], SceneBatch], Tensor], Tensor | None]
 """``(step, steps, denoised, std) -> shift``: moves the denoised translations by ``shift`` (B, N, 3), m.
 
-``denoised`` is as for :data:`Watch`; ``std`` (3,) is the standard deviation of the denoised translations, m. If the
-shift is None, the step is not changed.
+``denoised`` is as for :data:`Watch`; ``std`` (3,) is the standard deviation of the denoised translations, m, on their
+device. If the shift is None, the step is not changed. If a guide has a method ``acts(std)``, it is called only at the
+steps at which the method, which gets ``std`` on the CPU, returns True.
 """
 Watch = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
 """``(step, steps, denoised) -> rows``: called at the steps of the denoising; chooses the scenes that continue.
@@ -64,18 +67,18 @@ class Estimating(Protocol):
     normalizer: Normalizer
     scene_type: SceneType
 
+    @property
+    def device(self) -> torch.device:
+        """Device of the weights."""
+
     def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
         """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
 
 
 def position_std(prior: Estimating, step: int, table: StepTable) -> Tensor:
-    """(3,) standard deviation of the denoised positions at a step of a chain, m; 0 on axes without extent."""
+    """(3,) standard deviation of the denoised positions at a step of a chain, m, on the CPU; 0 without extent."""
     _, std = prior.estimate(step, table)
-    return _in_metres(std, prior.normalizer.scale[TRANSLATION].to(std))
-
-
-def _in_metres(std: Tensor, scale: Tensor) -> Tensor:
-    """(3,) deviations in metres of normalised ones; 0 where ``scale`` (3,) is 0."""
+    scale = prior.normalizer.scale[TRANSLATION].to(std)
     return torch.where(scale == 0, torch.zeros_like(scale), std / scale)
 
 
@@ -108,16 +111,14 @@ class PhysicsGuidance:
         self.strength = strength
         self._movable = movable
 
-    def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch], std: Tensor) -> Tensor | None:
-        """(B, N, 3) m, how far the denoised positions move; None at steps at which nothing moves.
+    def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch], std: Tensor) -> Tensor:
+        """(B, N, 3) m, how far the denoised positions move.
 
         Args:
             step, steps: not used.
             denoised: function that gives the B scenes that the network expects.
             std: (3,) standard deviation of their positions along the axes of the world, m.
         """
-        if not self.acts(std):
-            return None
         return self.strength * corrections(denoised(), std, self._movable)
 
     @staticmethod
@@ -163,10 +164,8 @@ class NumberGuidance:
     """
 
     def __init__(self, prompts: Sequence[str], scene_type: str | SceneType) -> None:
-        library = get_scene_type(scene_type).library
-        kinds: dict[str, int] = {}
-        of_asset = [kinds.setdefault(asset.display_name, len(kinds)) for asset in library]
-        self._kinds = torch.tensor([*of_asset, len(kinds)])  # (K,); *empty* is a kind of its own, the last
+        kinds, of_asset = names_of(get_scene_type(scene_type).library)
+        self._kinds = F.pad(of_asset, (0, 1), value=len(kinds))  # (K,); *empty* is a kind of its own, the last
         self._bounds = [number_bounds(claims_of(prompt, scene_type)) for prompt in prompts]
         self._names = [*kinds, ""]
         self._member = F.one_hot(self._kinds, len(self._names)).double()  # (K, R)
@@ -174,22 +173,23 @@ class NumberGuidance:
 
     def __call__(self, x: Tensor, reverse: ReverseStep) -> ReverseStep:
         """The step at x_t (B, N, D) with other probabilities of the masked slots' categories."""
-        if not isinstance(reverse, MixedStep) or reverse.masked is None or not bool(reverse.masked.any()):
+        if not isinstance(reverse, MixedStep) or reverse.masked is None:
             return reverse
-        masked, kinds, states = reverse.masked, self._kinds.to(x.device), state_of(x[..., POSE_FEATURES:])
+        if reverse.masked.device.type == "cpu" and not reverse.masked.any():
+            return reverse
+        masked, states = reverse.masked, state_of(x[..., POSE_FEATURES:])
+        kinds, member = (constant_on(table, x.device) for table in (self._kinds, self._member))
         probs, chance = reverse.probs[..., :-1], 1 - reverse.probs[..., -1:]
-        member = self._member.to(x.device)
         drawn = torch.where(masked[..., None], probs.double(), 0.0) @ member / chance.clamp(min=_TINY).double()
-        visible = F.one_hot(states, len(kinds) + 1)[..., :-1].sum(dim=1).double() @ member
-        low, high = (bound.to(visible) - visible for bound in self._limits_of(x.shape[1]))
+        visible = one_hot(states, len(kinds), torch.float64).sum(dim=1) @ member
+        low, high = (constant_on(bound, x.device) - visible for bound in self._limits_of(x.shape[1]))
         weights = kind_weights(drawn, low.clamp(min=0.0), high.clamp(min=0.0))  # (B, R)
         tilted = probs * weights[:, kinds].unsqueeze(1).to(probs)
         tilted = tilted * (chance / tilted.sum(dim=-1, keepdim=True).clamp(min=_TINY))
         changed = (weights - 1).abs() > _SAME
         tilted = torch.where(masked[..., None] & changed.any(dim=-1)[:, None, None], tilted, probs)
         together = ((low == high) | changed)[:, kinds]
-        others = torch.full_like(self._kinds, -1).expand(len(x), -1) if reverse.groups is None else reverse.groups
-        groups = torch.where(together, kinds + 2 * len(kinds), others.to(x.device))
+        groups = torch.where(together, kinds + 2 * len(kinds), -1 if reverse.groups is None else reverse.groups)
         return reverse._replace(probs=torch.cat([tilted, reverse.probs[..., -1:]], dim=-1), groups=groups)
 
     def _limits_of(self, slots: int) -> tuple[Tensor, Tensor]:
@@ -322,6 +322,7 @@ def guidance_hook(
         physics_guidance: strength, 0 for none.
         guide, watch: callables of the caller.
     """
+    scale, moved = (there.to(prior.device) for there in (prior.normalizer.scale[TRANSLATION], moved))
     movable = moved.squeeze(-1)
     guides: list[Guide] = [] if guide is None else [guide]
     draw = None
@@ -331,6 +332,8 @@ def guidance_hook(
     if physics_guidance:
         guides.append(PhysicsGuidance(physics_guidance, movable))
     see = getattr(watch, "see", None)
+    errors = [position_std(prior, step, table) for step in range(len(table))] if guides else []
+    there = torch.stack(errors).to(prior.device) if guides else scale
 
     def hook(step: int, x: Tensor, reverse: ReverseStep) -> ReverseStep:
         estimate = reverse.denoised
@@ -344,14 +347,11 @@ def guidance_hook(
         def denoised() -> SceneBatch:
             return scenes(estimate)
 
-        if guides:
-            weight, std = prior.estimate(step, table)
-            scale = prior.normalizer.scale[TRANSLATION].to(std)
-            metres = _in_metres(std, scale)
         for each in guides:
-            shift = each(step, len(table), denoised, metres)
+            acts = getattr(each, "acts", None)
+            shift = each(step, len(table), denoised, there[step]) if acts is None or acts(errors[step]) else None
             if shift is not None:
-                reverse = reverse.shifted(weight * scale * shift.to(std) * moved.to(std))
+                reverse = reverse.shifted(prior.estimate(step, table)[0] * scale * shift.to(scale) * moved)
         rows = None if watch is None else watch(step, len(table), denoised)
         return reverse if rows is None else reverse.take(rows.to(x.device))
 

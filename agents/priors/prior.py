@@ -431,9 +431,9 @@ class ScenePrior(nn.Module, ABC):
         """
 
     def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
-        """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
+        """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised, on the CPU."""
         weight, std = self.process.estimate(int(table.timesteps[step]), int(table.previous[step]), self.residual)
-        return weight, std[TRANSLATION].to(self.device)
+        return weight, std[TRANSLATION]
 
     @torch.no_grad()
     def sample(

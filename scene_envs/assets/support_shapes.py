@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import torch
 from scipy.ndimage import binary_fill_holes, grey_dilation
+from torch import Tensor
 
-from scene_envs.arrays import Array, Index, Mask
+from scene_envs.arrays import Array, Mask
 from scene_envs.assets.base import Asset, AssetLibrary, ConvexPart
 
 _GRID = 48
@@ -26,31 +28,33 @@ _LEVEL = 0.005
 
 @dataclass(frozen=True, eq=False)
 class LibraryShapes:
-    """Shapes of C assets as padded arrays, in asset frames, m."""
+    """Shapes of C assets as padded float64 tensors on one device, in asset frames, m."""
 
-    points: Array  # (C, 3, V) extreme points
-    center: Array  # (C, 3) centre of mass
-    bounds: Array  # (C, 2, 3) lowest and highest corner
-    top: Array  # (C, G, G) height of the upper side per cell; -inf outside the asset
-    wide: Array  # (C, G, G) height of the upper side, widened by about a centimetre
-    covered: Mask  # (C, G, G) bool, the widened outline with its holes filled
-    low: Array  # (C, 2) lowest corner of the maps
-    cell: Array  # (C, 2) size of a cell
-    rim: Array  # (C,) height of the lowest way out of a container; -inf for other assets
-    well: Array  # (C,) height of the bottom of a container
-    tiers: Array  # (C, L) heights of tiers from the top, NaN beyond their number; assets with fewer than two have none
-    static: Mask  # (C,) bool
+    points: Tensor  # (C, 3, V) extreme points
+    center: Tensor  # (C, 3) centre of mass
+    bounds: Tensor  # (C, 2, 3) lowest and highest corner
+    top: Tensor  # (C, G, G) height of the upper side per cell; -inf outside the asset
+    wide: Tensor  # (C, G, G) height of the upper side, widened by about a centimetre
+    covered: Tensor  # (C, G, G) bool, the widened outline with its holes filled
+    low: Tensor  # (C, 2) lowest corner of the maps
+    cell: Tensor  # (C, 2) size of a cell
+    rim: Tensor  # (C,) height of the lowest way out of a container; -inf for other assets
+    well: Tensor  # (C,) height of the bottom of a container
+    tiers: Tensor  # (C, L) heights of tiers from the top, NaN beyond their number; assets with fewer than two have none
+    static: Tensor  # (C,) bool
 
-    def cells(self, category: Index, points: Array) -> tuple[Index, ...]:
+    def cells(self, category: Tensor, points: Tensor) -> tuple[Tensor, ...]:
         """Indices (category, i, j) of asset-frame ``points`` (..., 3) into the maps; cells at the edge are empty."""
-        where = np.floor((points[..., :2] - self.low[category]) / self.cell[category])
-        where = np.clip(where, 0, _GRID - 1).astype(np.int64)
+        where = ((points[..., :2] - self.low[category]) / self.cell[category]).floor().clamp(0, _GRID - 1).long()
         return category, where[..., 0], where[..., 1]
 
 
 @lru_cache(maxsize=32)
-def library_shapes(library: AssetLibrary) -> LibraryShapes:
-    """The shapes of ``library``, made once."""
+def library_shapes(library: AssetLibrary, device: torch.device) -> LibraryShapes:
+    """The shapes of ``library``, made once, and copied to each device once."""
+    if device.type != "cpu":
+        made = library_shapes(library, torch.device("cpu"))
+        return LibraryShapes(**{name: table.to(device) for name, table in vars(made).items()})
     assets = list(library)
     top, wide, covered, low, cell = map(np.stack, zip(*map(_maps, assets), strict=True))
     points = [_extreme_points(asset.fine) for asset in assets]
@@ -58,20 +62,12 @@ def library_shapes(library: AssetLibrary) -> LibraryShapes:
     levels = [_tiers(asset) for asset in assets]
     most = max(1, *(len(level) for level in levels))
     wells = np.array([_hollow(asset, *maps) for asset, *maps in zip(assets, top, wide, low, cell, strict=True)])
-    return LibraryShapes(
-        points=np.stack([np.concatenate([p, np.repeat(p[:1], size - len(p), axis=0)]).T for p in points]),
-        center=np.stack([asset.center_of_mass for asset in assets]),
-        bounds=np.stack([asset.bounds for asset in assets]),
-        top=top,
-        wide=wide,
-        covered=covered,
-        low=low,
-        cell=cell,
-        rim=wells[:, 0],
-        well=wells[:, 1],
-        tiers=np.stack([np.concatenate([level, np.full(most - len(level), np.nan)]) for level in levels]),
-        static=np.array([asset.static for asset in assets]),
-    )
+    tables = {name: np.stack([getattr(asset, name) for asset in assets]) for name in ("bounds", "static")}
+    tables |= {"center": np.stack([asset.center_of_mass for asset in assets]), "rim": wells[:, 0], "well": wells[:, 1]}
+    tables |= {"top": top, "wide": wide, "covered": covered, "low": low, "cell": cell}
+    tables["points"] = np.stack([np.concatenate([p, np.repeat(p[:1], size - len(p), axis=0)]).T for p in points])
+    tables["tiers"] = np.stack([np.concatenate([level, np.full(most - len(level), np.nan)]) for level in levels])
+    return LibraryShapes(**{name: torch.from_numpy(table.copy()) for name, table in tables.items()})
 
 
 def _maps(asset: Asset) -> tuple[Array, Array, Mask, Array, Array]:

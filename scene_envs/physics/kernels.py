@@ -162,8 +162,10 @@ def gaps_kernel(chunk: Chunk, *, engine: str, limit: float) -> dict[str, Any]:
 
     physics, objects, valid = _start(chunk, engine)
     poses = map(torch.from_numpy, (chunk.categories, chunk.translations, chunk.rotations))
-    outlines, standing, _ = Placed.of_scenes(chunk.scene_type, *poses)
-    ignored = Contacts.of(outlines, standing).holding().carries() | (objects.fixed[:, None] & objects.fixed)
+    outlines, standing = Placed.of_scenes(chunk.scene_type, *poses)
+    carried = standing.carried(Contacts.of(outlines, standing).holding().counted(standing.slot).support)
+    ignored = carried[standing.scene[:, None], standing.slot[:, None], standing.slot].numpy()
+    ignored |= objects.fixed[:, None] & objects.fixed
     ignored |= ignored.T | (objects.scene[:, None] != objects.scene)
     placed = place(physics.library, objects, "fine")
     shapes, nearest = shapes_of(chunk.scene_type.library.assets), np.full(len(objects), limit)

@@ -16,6 +16,7 @@ from agents.cli.keys import keys_of
 from agents.cli.main import load_command
 from agents.configuration.composition import DeviceKeys
 from agents.networks.denoisers import Denoiser
+from agents.planning.gradient import Guidance, overlap
 from agents.post_training import post_train
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import collect, finished_scenes
@@ -98,6 +99,31 @@ def test_a_chain_stays_on_its_device(process: str, text: bool, monkeypatch: pyte
     assert x.device == GPU
     # attention to texts has another form on a CPU
     assert torch.allclose(plain(batch.tensor), expected.tensor, rtol=0, atol=1e-4)  # GELU rounds otherwise on a CPU
+
+
+def test_guidance_by_claims_numbers_and_gradients_stays_on_its_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps copy nothing, and read only that scenes are valid."""
+    prompts = ["A scene where two cups are each on top of a plate.", "A scene where the teapot is behind the cup."]
+    prior = tiny_prior("dimsum_table", process="mixed", text=True, kernel="squared_absorbing")
+    gradient = Guidance(overlap, 1.0, 0.0)
+    kept = torch.zeros(2, 34, dtype=torch.bool)
+    scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 2)
+    how = {"prompt": prompts, "claim_guidance": 2.0, "guide": gradient, "num_steps": STEPS}
+    expected = prior.inpaint(scenes, ~kept, **how)
+    with fake_gpu(monkeypatch) as crossings:
+        to_gpu(prior)
+        there, free = scenes.to("cuda"), fake(~kept)
+        counts = []
+        for steps in (STEPS, 2 * STEPS, STEPS, 2 * STEPS):  # the first two copy constants
+            crossings.clear()
+            prior.inpaint(there, free, **how | {"num_steps": steps})
+            del crossings.to_gpu["prior.py:draw_noise"]  # one generator for each scene, on the CPU
+            for check in ("_require_scene_tensor", "from_parts"):  # that new scenes are finite, with known categories
+                del crossings.reads[f"scene.py:{check}"]
+            counts.append([dict(each) for each in (crossings.to_host, crossings.to_gpu, crossings.reads)])
+        batch = prior.inpaint(there, free, **how)
+    assert counts[2] == counts[3]  # whatever the number of steps
+    torch.testing.assert_close(plain(batch.tensor), expected.tensor, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("process", ["continuous", "mixed"])

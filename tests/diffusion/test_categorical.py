@@ -156,3 +156,14 @@ def test_unknown_kernels_and_too_few_levels_are_refused() -> None:
         make_categorical_schedule("absorbin")
     with pytest.raises(InvalidInputError, match="at least 2"):
         make_categorical_schedule("uniform", 1)
+
+
+@pytest.mark.parametrize("kernel", ["absorbing", "uniform"])
+def test_the_tables_of_a_stride_give_the_posterior_of_every_state(kernel: str) -> None:
+    """A timestep of all scenes reads tables, one for each scene computes anew: the bits are the same."""
+    process = CategoricalProcess(make_categorical_schedule(kernel, 50), 4)
+    states, probs = torch.arange(5).repeat(3, 1), torch.rand(3, 5, 4, generator=torch.Generator().manual_seed(0))
+    for _ in range(2):  # made, then kept
+        for t, previous in ((50, 40), (7, 3), (3, 0)):
+            own = process.posterior(states, probs, torch.full((3,), t), torch.full((3,), previous))
+            assert torch.equal(process.posterior(states, probs, t, previous), own)

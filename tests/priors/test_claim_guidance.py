@@ -25,9 +25,7 @@ STD = torch.full((3,), 0.03)
 def shift_of(scene: SceneBatch, prompt: str, std: Tensor = STD, **settings: float) -> Tensor:
     """(N, 3) m that the first scene moves by at one step."""
     guidance = ClaimGuidance([prompt], scene.scene_type, settings.get("strength", 1.0))
-    shift = guidance(0, 50, lambda: scene, std)
-    assert shift is not None
-    return shift[0]
+    return guidance(0, 50, lambda: scene, std)[0]
 
 
 def followed(scene: SceneBatch, prompt: str, steps: int = 40) -> SceneBatch:
@@ -35,7 +33,6 @@ def followed(scene: SceneBatch, prompt: str, steps: int = 40) -> SceneBatch:
     guidance = ClaimGuidance([prompt], scene.scene_type, 1.0)
     for step in range(steps):
         shift = guidance(step, steps, lambda: scene, STD)  # noqa: B023
-        assert shift is not None
         scene = scene.with_poses(scene.translations + shift, scene.rotations)
     return scene
 
@@ -45,7 +42,7 @@ def holds(scene: SceneBatch, prompt: str) -> bool:
 
 
 def slope(*numbers: float) -> float:
-    return float(probability_slope(*(np.array([number]) for number in numbers))[0])
+    return float(probability_slope(*torch.tensor(numbers, dtype=torch.float64)[:, None]))
 
 
 # -- the moves --------------------------------------------------------------------------------------
@@ -71,7 +68,6 @@ def test_two_things_share_a_move_and_one_that_is_fixed_leaves_it_to_the_other() 
     torch.testing.assert_close(moved[1], -moved[2])
     assert float(moved[1, 1]) < -0.1  # left is -y
     kept = ClaimGuidance([prompt], "dimsum_table", 1.0, torch.arange(34)[None] != 2)(0, 50, lambda: pair, STD)
-    assert kept is not None
     assert float(kept[0, 1, 1]) < 1.9 * float(moved[1, 1])
     assert not kept[0, 2].any()
     torch.testing.assert_close(shift_of(pair, prompt, strength=2.0), 2 * moved)
@@ -80,7 +76,12 @@ def test_two_things_share_a_move_and_one_that_is_fixed_leaves_it_to_the_other() 
 def test_nothing_moves_at_low_noise_without_claims_or_where_they_are_out_of_doubt() -> None:
     pair = build("dimsum_table", [("teapot", (0.0, -0.3, 0.0)), ("teacup", (0.0, 0.3, 0.0))])
     prompt = "A scene where the teapot is to the left of the cup."
-    assert ClaimGuidance([prompt], "dimsum_table", 2.0)(0, 50, lambda: pair, torch.full((3,), 0.01)) is None
+    guidance = ClaimGuidance([prompt], "dimsum_table", 2.0)
+    assert [guidance.acts(torch.tensor(std)) for std in ([0.01] * 3, [0.03] * 3, [0.01, 0.01, 0.1])] == [
+        False,
+        True,
+        False,
+    ]
     assert float(shift_of(pair, prompt).abs().max()) < 1e-6
     for text in ("", "A scene with 3 objects.", "no such phrase", "A scene where the lid is on the moon."):
         assert not shift_of(pair, text).any()
@@ -199,6 +200,22 @@ def test_what_a_thing_carries_goes_with_it() -> None:
     moved = shift_of(scene, "A scene where the plate is to the left of the teapot.")
     torch.testing.assert_close(moved[2], moved[1])
     assert float(moved[1, 1]) < -0.05
+
+
+def test_each_scene_of_a_batch_moves_as_it_does_alone() -> None:
+    """Scenes of three prompts each, with supports, places, sides and orders, and one that cannot be read."""
+    rng = np.random.default_rng(3)
+    scenes = get_grammar("living_room_shelf").sample(rng, 12)
+    noise = torch.randn(scenes.translations.shape, generator=torch.Generator().manual_seed(0))
+    scenes = scenes.with_poses(scenes.translations + 0.05 * noise, scenes.rotations)
+    prompts = describe(get_grammar("living_room_shelf").sample(rng, 12), rng, kinds=["relations"])
+    prompts[5] = "no such phrase"
+    together = ClaimGuidance(prompts, "living_room_shelf", 2.0)(0, 50, lambda: scenes, STD)
+    for row, prompt in enumerate(prompts):
+        alone = ClaimGuidance([prompt], "living_room_shelf", 2.0)(0, 50, lambda: scenes[row : row + 1], STD)  # noqa: B023
+        torch.testing.assert_close(together[row], alone[0], rtol=0, atol=1e-9)
+    assert not together[5].any()
+    assert int(together.flatten(1).any(dim=1).sum()) > 3
 
 
 # -- priors -----------------------------------------------------------------------------------------

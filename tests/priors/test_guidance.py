@@ -208,7 +208,8 @@ def test_moves_are_the_corrections_times_the_strength(overlapping: SceneBatch) -
 
 
 def test_nothing_moves_while_positions_are_uncertain(overlapping: SceneBatch) -> None:
-    assert PhysicsGuidance(1.0)(0, 50, lambda: overlapping, torch.tensor([0.01, 0.04, 0.001])) is None
+    assert not PhysicsGuidance.acts(torch.tensor([0.01, 0.04, 0.001]))
+    assert PhysicsGuidance.acts(torch.tensor([0.01, 0.01, 0.3]))
     high = PhysicsGuidance(1.0)(0, 50, lambda: overlapping, torch.tensor([0.01, 0.01, 0.3]))  # tiers of a shelf
     assert high is not None
 

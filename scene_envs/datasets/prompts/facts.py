@@ -6,8 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.errors import InvalidInputError
@@ -85,7 +88,7 @@ class SceneFacts:
     boxes: Array
     fixed: Mask
     tiers: Index
-    held: Holding
+    held: Holding[NDArray[Any]]
     tolerances: Tolerances = NOMINAL
 
     @property
@@ -178,30 +181,29 @@ def scene_facts(batch: SceneBatch, tolerances: Tolerances = NOMINAL) -> list[Sce
 def facts_under(batch: SceneBatch, tolerances: Sequence[Tolerances]) -> list[list[SceneFacts]]:
     """The facts of each scene under each of several tolerances; geometry is computed once."""
     result: list[list[SceneFacts]] = [[] for _ in tolerances]
+    display = [asset.display_name for asset in batch.scene_type.library]
+    axes = torch.from_numpy(viewer_axes(batch.scene_type)).to(batch.tensor.device)
     for start in range(0, len(batch), _CHUNK):
         some = batch[start : start + _CHUNK]
-        display = [asset.display_name for asset in some.scene_type.library]
-        axes = viewer_axes(some.scene_type)
-        shapes, placed, slot = Placed.of_scenes(some.scene_type, some.categories, some.translations, some.rotations)
-        positions = placed.center @ axes.T
-        points = axes @ placed.points
-        boxes = np.stack([points.min(axis=-1), points.max(axis=-1)], axis=1)
-        tiers = np.isfinite(shapes.tiers[placed.category]).sum(axis=1)
+        shapes, placed = Placed.of_scenes(some.scene_type, some.categories, some.translations, some.rotations)
+        points, tiered = axes @ placed.points, torch.isfinite(shapes.tiers[placed.category])
+        corners = torch.stack([points.amin(dim=-1), points.amax(dim=-1)], dim=1)
+        columns = placed.category, placed.slot, placed.center @ axes.T, corners, placed.fixed, tiered.sum(dim=1)
+        category, slots, positions, boxes, fixed, tiers = (column.cpu().numpy() for column in columns)
+        counts = torch.bincount(placed.scene, minlength=len(some))
+        ends = counts.cumsum(0)
+        number = torch.arange(len(placed.scene), device=ends.device) - (ends - counts)[placed.scene]
         contacts = Contacts.of(shapes, placed)
-        parts = [slice(*np.searchsorted(placed.scene, (row, row + 1))) for row in range(len(some))]
         for facts, limits in zip(result, tolerances, strict=True):
-            holding = contacts.holding(limits.contact)
-            facts += [
-                SceneFacts(
-                    tuple(display[c] for c in placed.category[part]),
-                    slot[part],
-                    positions[part],
-                    boxes[part],
-                    placed.fixed[part],
-                    tiers[part],
-                    holding.part(part),
-                    limits,
+            holding = contacts.holding(limits.contact).counted(number)
+            held = {name: column.cpu().numpy() for name, column in vars(holding).items()}
+            for stop, count in zip(ends.tolist(), counts.tolist(), strict=True):
+                part = slice(stop - count, stop)
+                names = tuple(display[c] for c in category[part])
+                below = Holding(**{name: column[part] for name, column in held.items()})
+                facts.append(
+                    SceneFacts(
+                        names, slots[part], positions[part], boxes[part], fixed[part], tiers[part], below, limits
+                    )
                 )
-                for part in parts
-            ]
     return result
