@@ -114,7 +114,7 @@ class Collider:
         (n, 3) m of each object: no face plane of their coarse parts keeps them apart from its start to its end.
         """
         ends = pairs.low + np.minimum(way, 0.0), pairs.high + np.maximum(way, 0.0)
-        near = _boxes_near(*ends, first, second, NEAR)
+        near = boxes_near(*ends, first, second, NEAR)
         first, second = first[near], second[near]
         used, local = np.unique(np.concatenate([first, second]), return_inverse=True)
         placed = place(self.library, objects[used], "coarse")
