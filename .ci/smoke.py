@@ -116,15 +116,18 @@ def check_pictures() -> str:
     """A table and a dish seen from above are as far away, and as large, as the pinhole equations say."""
     import numpy as np
 
+    from scene_envs.render import Pinhole
     from scene_envs.render.stage import get_stage
-    from scene_envs.scene_types import Camera
 
     chunk = _chunk(("serving_dish", 0.1, 0.0, 0.0))
     stage = get_stage(chunk.scene_type.assets, chunk.scene_type.asset_folders)
     stage.place(chunk.translations[0], chunk.rotations[0], chunk.categories[0])
-    camera = Camera((0.1, 0.0, 1.5), (0.1, 0.0, 0.0), (1.0, 0.0, 0.0), fov_y=30.0)
-    frame = stage.look(camera, 320, 240)
-    color = stage.paint(frame, np.array([0.0, 0.0, 1.0]))
+    camera = Pinhole.at((0.1, 0.0, 1.5), (0.1, 0.0, 0.0), (1.0, 0.0, 0.0), 30.0, 320, 240)
+    frame = stage.look(camera)
+    rows, columns = np.nonzero(frame.slots == 1)
+    points = camera.rays(columns + 0.5, rows + 0.5) * frame.depth[rows, columns, None]
+    faces, light = frame.faces[rows, columns], np.array([0.0, 0.0, 1.0])
+    color = stage.paint(camera, faces, points, stage.normals(camera), light)
     seen = frame.slots == 1
     mesh = chunk.scene_type.library["serving_dish"].visual
     nearest = 1.5 - mesh.bounds[1, 2]
@@ -132,8 +135,7 @@ def check_pictures() -> str:
     rows = np.flatnonzero(seen.any(axis=1))
     expected = 120.0 / np.tan(np.radians(15.0)) * mesh.extents[0] / nearest
     assert abs(rows[-1] - rows[0] + 1 - expected) < 4.0, (rows, expected)
-    assert color[seen].mean() > 60.0
-    assert (color[frame.slots < 0] == 0.0).all()
+    assert color.mean() > 60.0
     return f"{int(seen.sum())} pixels of a dish"
 
 

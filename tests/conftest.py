@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import sys
 from collections.abc import Iterator
@@ -54,17 +53,17 @@ def _coarse_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
     pictures = sys.modules.get("scene_envs.render.pictures")
     if pictures is None or request.path.parent.name == "render":
         return
-    draw, lamp = pictures._picture, pictures.light_camera
+    draw, lamp = pictures.draw_picture, pictures.light_camera
 
-    def coarse(stage: Any, camera: Any, width: int, height: int, *scene: Any) -> Any:
-        small = draw(stage, camera, -(-width // 4), -(-height // 4), *scene)
-        return small.repeat(4, axis=0).repeat(4, axis=1)[:height, :width]
+    def coarse(stage: Any, camera: Any, *scene: Any) -> Any:
+        small = draw(stage, camera.resized(-(-camera.width // 4), -(-camera.height // 4)), *scene)
+        return small.repeat(4, axis=0).repeat(4, axis=1)[: camera.height, : camera.width]
 
     def coarse_lamp(scene_type: Any) -> Any:
         camera = lamp(scene_type)
-        return dataclasses.replace(camera, width=camera.width // 4, height=camera.height // 4)
+        return camera.resized(camera.width // 4, camera.height // 4)
 
-    monkeypatch.setattr(pictures, "_picture", coarse)
+    monkeypatch.setattr(pictures, "draw_picture", coarse)
     monkeypatch.setattr(pictures, "light_camera", coarse_lamp)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -115,9 +116,10 @@ def render_classifier_accuracy(
 
 def class_images(batches: list[SceneBatch], width: int, height: int) -> tuple[Tensor, int]:
     """(B, H, W) uint8 indices of the colours of the semantic renders of all scenes, and the number of colours."""
-    from scene_envs.render import render
+    from scene_envs.render import observe
 
-    images = np.concatenate([render(b, style="semantic", width=width, height=height) for b in batches])
+    views = [observe(b, [replace(b.scene_type.camera, width=width, height=height)], ["semantic"]) for b in batches]
+    images = np.concatenate([view["semantic"] for (view,) in views])
     red, green, blue = np.moveaxis(images.astype(np.int32), -1, 0)
     colors, index = np.unique((red << 16) | (green << 8) | blue, return_inverse=True)
     return torch.from_numpy(index.reshape(images.shape[:-1]).astype(np.uint8)), len(colors)

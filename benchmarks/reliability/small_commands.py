@@ -70,6 +70,7 @@ REPEATABLE = {
                          ("scenes.safetensors",)),
     "export": Command(("export", "scenes=PLACE/data", "count=2", "formats=[urdf,npz]", "workers=0"),
                       ("scene_001/scene.urdf",)),
+    "render": Command(("render", "scenes=PLACE/data", "count=2", "modes=[depth,instance]"), ("annotations.json",)),
     "view": Command(("view", "scenes=PLACE/data", "count=2", "pictures=0"), ("viewer.html",)),
     "evaluate": Command(("evaluate", _PRIORS[1], "count=4", "measures=layout", "workers=0", "num_steps=2"),
                         ("metrics.json",)),

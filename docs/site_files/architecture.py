@@ -17,7 +17,7 @@ ROWS: tuple[dict[str, tuple[int, str]], ...] = (
     {"scene_envs.scene": (0, "SceneBatch, normalizer")},
     {
         "scene_envs.physics": (0, "overlap, settling, projection"),
-        "scene_envs.render": (1, "pictures, viewer"),
+        "scene_envs.render": (1, "pictures, sensors, viewer"),
         "agents.diffusion": (3, "forward and reverse processes"),
     },
     {"scene_envs.grammars": (0, "structures and exact poses"), "scene_envs.export": (1, "files for simulators")},

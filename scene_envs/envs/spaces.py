@@ -128,7 +128,7 @@ def picture(batch: SceneBatch, highlight: Tensor | None = None) -> np.ndarray:
     """(B, H, W, 3) uint8 pictures, with the objects of ``highlight`` (B, N) bool in red (loads the renderer)."""
     from scene_envs.render import render
 
-    return render(batch.to("cpu"), style="picture", highlight=highlight)
+    return render(batch.to("cpu"), highlight=highlight)
 
 
 class ResetNeededError(SceneEnvsError, gymnasium.error.ResetNeeded):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scene_envs.arrays import Array, Index
 from scene_envs.assets import Asset, get_library
 from scene_envs.errors import InvalidInputError
-from scene_envs.render.raster import Pinhole, corner_weights, visible_triangles
+from scene_envs.render.raster import Pinhole, visible_triangles
 from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type
 
 _AMBIENT, _DIFFUSE = 0.70, 0.40
@@ -25,8 +25,6 @@ _FOV = 28.0
 _MARGIN = 0.05
 _LAMP_PIXELS = 512, 1024
 """Resolution of the lamp's depth image for framings of a radius up to 2 m, and for larger ones."""
-_STRIDE = 2
-"""Normals and contact shades are computed for every ``_STRIDE``-th pixel of each axis, and repeated."""
 _TURNS = (np.arange(12) + 0.5) * np.pi * (3.0 - np.sqrt(5.0))
 _RADII = np.sqrt((np.arange(12) + 0.5) / 12)
 _SPIRAL = np.stack([_RADII * np.cos(_TURNS), _RADII * np.sin(_TURNS)], axis=1).astype(np.float32)
@@ -72,38 +70,63 @@ class Stage:
         self._colors = np.concatenate([none, *(model.colors for model in models)])
         faces = (model.faces + start for model, start in zip(models, starts, strict=False))
         self._faces = np.concatenate([none.astype(np.int64), *faces])
-        self._slot_of = np.repeat(np.array(slots, dtype=np.int64), [len(model.faces) for model in models])
+        self._slots, self._starts = slots, starts[:-1]
+        # (F,): the slot of each triangle
+        self.slot_of = np.repeat(np.array(slots, dtype=np.int64), [len(model.faces) for model in models])
 
-    def look(self, camera: Camera, width: int, height: int) -> Frame:
-        """What ``camera`` sees of the placed objects, in an image of ``width`` x ``height`` pixels."""
-        pinhole = Pinhole.at(camera.position, camera.target, camera.up, camera.fov_y, width, height)
-        faces, depth = visible_triangles(self._triangles(pinhole), pinhole)
-        slots = np.full(faces.shape, -1, dtype=np.int64)
-        slots[faces >= 0] = self._slot_of[faces[faces >= 0]]
-        return Frame(depth, slots, faces, pinhole)
+    def look(self, camera: Pinhole) -> Frame:
+        """What ``camera`` sees of the placed objects."""
+        faces, depth = visible_triangles(self._points(camera), self._faces, camera)
+        return Frame(depth, np.append(self.slot_of, -1)[faces], faces, camera)
 
-    def paint(self, frame: Frame, to_light: Array) -> Image:
-        """(H, W, 3) float32 in 0..255: colours of what ``frame`` sees, lit from the direction ``to_light`` (3,) without
-        shadows; 0 without an object.
+    def enclosing_slot(self, point: Array) -> int:
+        """Slot of an object whose visual mesh encloses ``point`` (3,), m; -1 without one."""
+        if not self._slots:
+            return -1
+        low, high = (limit.reduceat(self._vertices, self._starts) for limit in (np.minimum, np.maximum))
+        for index in np.flatnonzero(((low < point) & (point < high)).all(axis=1)).tolist():
+            triangles = self._vertices[self._faces[self.slot_of == self._slots[index]]]
+            if abs(winding_number(triangles, point)) > 0.5:
+                return self._slots[index]
+        return -1
+
+    def normals(self, camera: Pinhole) -> Image:
+        """(F + 1, 3) float32: unit normals of all triangles, camera frame, on the side that ``camera`` sees; the last
+        one is 0 and stands for no triangle.
         """
-        rows, columns = np.nonzero(frame.faces >= 0)
-        faces, triangles = frame.faces[rows, columns], self._triangles(frame.camera)
-        weights = corner_weights(triangles, faces, rows, columns, frame.camera).astype(np.float32)
-        # Light falls on the side of a surface that the camera sees, whichever way its normals point.
-        away = np.einsum("tk,tk->t", triangles[:, 0], np.cross(*np.diff(triangles, axis=1).swapaxes(0, 1))) > 0.0
-        facing = self._normals @ (to_light / np.linalg.norm(to_light))
-        towards = np.maximum(np.where(away[:, None], -1.0, 1.0) * facing[self._faces], 0.0)
-        lit = (self._colors[self._faces] * (_AMBIENT + _DIFFUSE * towards[..., None])).astype(np.float32)
-        lit[:, 1:] -= lit[:, :1]
-        corners = lit.reshape(-1, 9)[faces]
-        color = np.zeros((*frame.faces.shape, 3), dtype=np.float32)
-        color[rows, columns] = np.minimum(
-            corners[:, :3] + weights[:, :1] * corners[:, 3:6] + weights[:, 1:] * corners[:, 6:], 255.0
-        )
-        return color
+        corners = self._points(camera)[self._faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        away = np.einsum("fk,fk->f", normals, corners[:, 0]) > 0.0
+        return np.concatenate([np.where(away[:, None], -normals, normals), np.zeros((1, 3))]).astype(np.float32)
 
-    def _triangles(self, camera: Pinhole) -> Array:
-        return (self._vertices @ camera.view[:3, :3].T + camera.view[:3, 3])[self._faces]
+    def paint(self, camera: Pinhole, faces: Index, points: Image, normals: Image, to_light: Array) -> Image:
+        """(P, 3) float32 in 0..255: colours of the points (P, 3) of triangles ``faces`` (P,), camera frame in m, lit
+        from the direction ``to_light`` (3,) of the world without shadows. ``normals`` are those of :meth:`normals`.
+        """
+        seen = np.zeros(len(self._faces), dtype=bool)
+        seen[faces] = True
+        (used,), at = np.nonzero(seen), (np.cumsum(seen) - 1)[faces]
+        corners = self._points(camera)[self._faces[used]]
+        # The weights of the second and the third corner of a triangle a, b, c are p . (c x a) and p . (a x b), divided
+        # by a . (b x c), in a point p of it.
+        across = np.cross(corners[:, [2, 0]], corners[:, [0, 1]])
+        volume = np.einsum("fk,fk->f", corners[:, 2], across[:, 1])[:, None, None]
+        across = across / np.where(volume == 0.0, 1.0, volume)
+        # Light falls on the side of a surface that the camera sees, whichever way its normals point.
+        own = self._normals[self._faces[used]]
+        side = np.sign(np.einsum("fjk,fk->fj", own @ camera.view[:3, :3].T, normals[used]))
+        towards = np.maximum(side * (own @ (to_light / np.linalg.norm(to_light))), 0.0)
+        lit = self._colors[self._faces[used]] * (_AMBIENT + _DIFFUSE * towards[..., None])
+        lit[:, 1:] -= lit[:, :1]
+        table = np.concatenate([across.reshape(-1, 6), lit.reshape(-1, 9)], axis=1).astype(np.float32)[at]
+        second = np.clip(np.einsum("pk,pk->p", table[:, 0:3], points), 0.0, 1.0)[:, None]
+        third = np.clip(np.einsum("pk,pk->p", table[:, 3:6], points), 0.0, 1.0)[:, None]
+        return np.minimum(table[:, 6:9] + second * table[:, 9:12] + third * table[:, 12:15], 255.0)
+
+    def _points(self, camera: Pinhole) -> Array:
+        view = camera.view
+        return self._vertices @ view[:3, :3].T + view[:3, 3]
 
     def _model(self, category: int) -> _Model:
         if category not in self._models:
@@ -128,6 +151,18 @@ class _Model:
 
 get_stage = cache(Stage)
 """The stage of this process for asset names in category order, which are looked up in the given folders first."""
+
+
+def winding_number(triangles: Array, point: Array) -> float:
+    """How often triangles (F, 3, 3) enclose a point (3,): 1 in a closed surface, -1 in one turned inside out, 0 out of
+    both, and a fraction near an open one (Van Oosterom and Strackee, 1983).
+    """
+    a, b, c = (triangles - point).swapaxes(0, 1)
+    ab, bc, ca = (np.einsum("fk,fk->f", *pair) for pair in ((a, b), (b, c), (c, a)))
+    a_length, b_length, c_length = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+    volume = np.einsum("fk,fk->f", a, np.cross(b, c))
+    rest = a_length * b_length * c_length + ab * c_length + bc * a_length + ca * b_length
+    return float(np.arctan2(volume, rest).sum() / (2.0 * np.pi))
 
 
 def vertex_colors(asset: Asset) -> NDArray[np.uint8]:
@@ -306,98 +341,68 @@ def picture_camera(scene_type: str | SceneType, width: int = 480, height: int = 
     return Camera(_triple(position), _triple(target), (0.0, 0.0, 1.0), width, height, _FOV)
 
 
-def light_camera(scene_type: SceneType) -> Camera:
+def light_camera(scene_type: SceneType) -> Pinhole:
     """The view from a far lamp that sees the whole workspace."""
     framing = frame_scene_type(scene_type)
-    distance = 8.0 * framing.radius
-    fov = 2.0 * np.degrees(np.arctan(1.1 * framing.radius / distance))
-    pixels = _LAMP_PIXELS[framing.radius > 2.0]
-    position = framing.center + distance * framing.to_light
-    return Camera(_triple(position), _triple(framing.center), (0.0, 1.0, 0.0), pixels, pixels, float(fov))
+    position = framing.center + 8.0 * framing.radius * framing.to_light
+    fov, pixels = 2.0 * float(np.degrees(np.arctan(1.1 / 8.0))), _LAMP_PIXELS[framing.radius > 2.0]
+    return Pinhole.at(_triple(position), _triple(framing.center), (0.0, 1.0, 0.0), fov, pixels, pixels)
 
 
 def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
     return (float(vector[0]), float(vector[1]), float(vector[2]))
 
 
-def camera_points(frame: Frame) -> Image:
-    """(H, W, 3): the visible point of each pixel in the camera frame (x right, y up, z backward), m."""
-    height, width = frame.depth.shape
-    x = ((np.arange(width, dtype=np.float32) + 0.5) * (2.0 / width) - 1.0) / frame.camera.focal[0]
-    y = (1.0 - (np.arange(height, dtype=np.float32) + 0.5) * (2.0 / height)) / frame.camera.focal[1]
-    depth = np.where(np.isfinite(frame.depth), frame.depth, 0.0).astype(np.float32)
-    return np.stack([x[None, :] * depth, y[:, None] * depth, -depth], axis=-1).astype(np.float32)
+def to_pinhole(camera: Camera | Pinhole, width: int | None = None, height: int | None = None) -> Pinhole:
+    """The pinhole camera of any camera, with images of another size where one is given."""
+    width, height = camera.width if width is None else width, camera.height if height is None else height
+    if isinstance(camera, Pinhole):
+        return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
+    return Pinhole.at(camera.position, camera.target, camera.up, camera.fov_y, width, height)
 
 
-def surface_normals(frame: Frame) -> Image:
-    """(H, W, 3): unit normals in the camera frame, facing the camera; those of every second pixel are repeated. Along
-    each axis the difference to the nearer neighbour is taken, so that edges of objects stay sharp.
+def soft_shadow(points: Image, camera: Pinhole, light: Frame, bias: float) -> NDArray[np.float32]:
+    """(P,) in 0..1: the part of the light that nearer objects hide from points (P, 3), in the frame of ``camera``, by
+    percentage-closer filtering in ``light``, the frame seen from the light. An occluder is nearer to it than the point
+    by at least ``bias`` (m).
     """
-    points = camera_points(frame)[::_STRIDE, ::_STRIDE]
-    along = [_shorter(np.diff(points, axis=axis), axis) for axis in (1, 0)]
-    normals = np.cross(along[1], along[0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    facing = np.where(np.einsum("hwk,hwk->hw", normals, points) > 0, np.float32(-1.0), np.float32(1.0))
-    return _enlarge((normals * facing[..., None]).astype(np.float32), frame.depth.shape)
-
-
-def soft_shadow(frame: Frame, light: Frame, normals: Image, *, bias: float = 0.004, lift: float = 0.008) -> Image:
-    """(H, W) in 0..1: the part of the light that nearer objects hide, by percentage-closer filtering in ``light``, the
-    frame seen from the light. An occluder is nearer to it than the point by at least ``bias`` (m). Points are raised
-    off their surface by ``lift`` (m), so that no surface shadows itself.
-    """
-    seen = np.isfinite(frame.depth)
-    to_light = (light.camera.view @ np.linalg.inv(frame.camera.view)).astype(np.float32)
-    points = (camera_points(frame)[seen] + np.float32(lift) * normals[seen]) @ to_light[:3, :3].T + to_light[:3, 3]
-    distance = np.maximum(-points[:, 2], np.float32(1e-3))  # objects may lie behind the lamp
+    to_light = (light.camera.view @ camera.pose).astype(np.float32)
+    points = points @ to_light[:3, :3].T + to_light[:3, 3]
+    distance = np.maximum(points[:, 2], np.float32(1e-3))  # objects may lie behind the lamp
     height, width = light.depth.shape
-    column = (points[:, 0] / distance * np.float32(light.camera.focal[0]) + 1.0) * (0.5 * width)
-    row = (1.0 - points[:, 1] / distance * np.float32(light.camera.focal[1])) * (0.5 * height)
+    column = points[:, 0] / distance * np.float32(light.camera.fx) + np.float32(light.camera.cx)
+    row = points[:, 1] / distance * np.float32(light.camera.fy) + np.float32(light.camera.cy)
+    limit = distance - np.float32(bias)
     nearest = light.depth.ravel()
     hidden = np.zeros(len(points), dtype=np.float32)
     for dx, dy in _SPIRAL * _SOFTNESS:
         index = _pixel(row + dy, height) * width + _pixel(column + dx, width)
-        hidden += nearest[index] < distance - bias
-    shadow = np.zeros(frame.depth.shape, dtype=np.float32)
-    shadow[seen] = hidden / len(_SPIRAL)
-    return shadow
+        hidden += nearest[index] < limit
+    return hidden / np.float32(len(_SPIRAL))
 
 
-def contact_shade(frame: Frame, normals: Image, *, radius: float = 0.04) -> Image:
-    """(H, W) in 0..1: ambient occlusion of each point by its surroundings within ``radius`` m, computed for every
-    second pixel of each axis and repeated; callers blur the result.
+def contact_shade(points: Image, normals: Image, camera: Pinhole, radius: float = 0.04) -> NDArray[np.float32]:
+    """(H, W) in 0..1: ambient occlusion of each visible point by its surroundings within ``radius`` m. Points and unit
+    normals (H, W, 3) are in the frame of ``camera``, the points without an object are 0; callers blur the result.
     """
-    grid = camera_points(frame)[::_STRIDE, ::_STRIDE]
-    height, width = grid.shape[:2]
-    rows, columns = np.nonzero(grid[..., 2] < 0)
-    surroundings = grid.reshape(-1, 3)
-    points, facing = grid[rows, columns], normals[::_STRIDE, ::_STRIDE][rows, columns]
-    reach_x = (0.5 * width * frame.camera.focal[0] * radius / -points[:, 2]).astype(np.float32)
-    reach_y = (0.5 * height * frame.camera.focal[1] * radius / -points[:, 2]).astype(np.float32)
+    height, width = points.shape[:2]
+    rows, columns = np.nonzero(points[..., 2] > 0)
+    surroundings = points.reshape(-1, 3)
+    points, facing = points[rows, columns], normals[rows, columns]
+    reach_x, reach_y = (np.float32(focal * radius) / points[:, 2] for focal in (camera.fx, camera.fy))
+    middle_x, middle_y = columns.astype(np.float32) + np.float32(0.5), rows.astype(np.float32) + np.float32(0.5)
     closed = np.zeros(len(points), dtype=np.float32)
     for dx, dy in _SPIRAL:
-        index = _pixel(rows + 0.5 + dy * reach_y, height) * width + _pixel(columns + 0.5 + dx * reach_x, width)
+        index = _pixel(middle_y + dy * reach_y, height) * width + _pixel(middle_x + dx * reach_x, width)
         offset = surroundings[index] - points
         square = np.einsum("nk,nk->n", offset, offset) + np.float32(1e-8)
         rise = np.einsum("nk,nk->n", offset, facing) / np.sqrt(square)
         closed += np.maximum(rise - np.float32(0.12), 0.0) * (square < 4.0 * radius**2)
     shade = np.zeros((height, width), dtype=np.float32)
     shade[rows, columns] = closed / len(_SPIRAL)
-    return _enlarge(shade, frame.depth.shape)
+    return shade
 
 
 def _pixel(position: NDArray[np.float32], size: int) -> NDArray[np.int32]:
     """The pixel that holds ``position`` (in pixels from the border), clamped to the image."""
     return np.clip(position, 0, size - 1).astype(np.int32)
-
-
-def _enlarge(image: Image, shape: tuple[int, ...]) -> Image:
-    return image.repeat(_STRIDE, axis=0).repeat(_STRIDE, axis=1)[: shape[0], : shape[1]]
-
-
-def _shorter(steps: Image, axis: int) -> Image:
-    """For each pixel the shorter of its backward and forward step: edges of objects are not crossed."""
-    first, last = np.take(steps, [0], axis=axis), np.take(steps, [-1], axis=axis)
-    backward, forward = np.concatenate([first, steps], axis=axis), np.concatenate([steps, last], axis=axis)
-    nearer = np.abs(backward[..., 2:]) <= np.abs(forward[..., 2:])
-    return np.where(nearer, backward, forward)

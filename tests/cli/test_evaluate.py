@@ -155,7 +155,7 @@ def test_all_leaves_out_what_cannot_be_measured_and_says_why(
         (["measures=noveltie"], "did you mean 'novelty'"),
         (["data=nowhere", "measures=layout"], "data='nowhere': nothing is at 'nowhere'"),
         (["heldout=somewhere", "measures=layout"], "needs data="),
-        (["count=1", "measures=layout"], "count >= 2"),
+        (["count=1", "measures=layout"], "count=1 must be at least 2"),
         (["prompt_count=1"], "prompt_count=1 must be from 2 to count="),
         (["count=4", "prompt_count=5"], "prompt_count=5 must be from 2 to count=4"),
     ],

@@ -38,12 +38,13 @@ def _contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize(
-    "command", ["export", "generate", "pretrain", "post-train", "evaluate", "view", "project", "search", "complete"]
+    "command",
+    ["export", "generate", "pretrain", "post-train", "evaluate", "view", "render", "project", "search", "complete"],
 )
 def test_the_folder_of_another_command_is_refused_untouched(command, drawn, capsys):
     before = _contents(drawn / "out")
     needed = ["data=grammar"] if command == "pretrain" else []
-    needed += [f"scenes={drawn / 'out'}"] if command in ("export", "view", "project", "complete") else []
+    needed += [f"scenes={drawn / 'out'}"] if command in ("export", "view", "render", "project", "complete") else []
     assert main([command, *needed, f"output={drawn / 'out'}"]) == 2
     err = capsys.readouterr().err
     assert "of scene-envs sample; give another output" in err

@@ -18,6 +18,7 @@ from scene_envs.scene import SceneBatch
 OWN_WORDS = {
     "project": ["workers=0", "pictures=0"],
     "view": ["pictures=0"],
+    "render": ["modes=[instance]"],
     "export": ["formats=npz", "workers=0"],
     "complete": ["num_steps=2", "pictures=0"],
     "rearrange": ["num_steps=2", "pictures=0"],

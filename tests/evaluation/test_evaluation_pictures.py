@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from agents.evaluation.set_network import SHIPPED, SetEncoder, blurred
 from benchmarks.set_encoder_training import SetEncoderTraining, damage, train_set_encoder
 from scene_envs.datasets import to_union
 from scene_envs.errors import CorruptFileError, InvalidInputError
-from scene_envs.render import render
+from scene_envs.render import observe
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import union_scene_type
 
@@ -209,7 +210,8 @@ def test_missing_objects_are_seen(scenes: SceneBatch) -> None:
 
 def test_class_images_are_the_renders(scenes: SceneBatch) -> None:
     index, colors = class_images([scenes[:2], scenes[2:3]], 48, 36)
-    images = torch.from_numpy(render(scenes[:3], style="semantic", width=48, height=36)).long()
+    camera = replace(scenes.scene_type.camera, width=48, height=36)
+    images = torch.from_numpy(observe(scenes[:3], [camera], ["semantic"])[0]["semantic"]).long()
     assert index.shape == (3, 36, 48)
     assert int(index.max()) == colors - 1
     for value in range(colors):

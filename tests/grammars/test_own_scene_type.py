@@ -24,7 +24,7 @@ from scene_envs.errors import UnknownNameError
 from scene_envs.export import export
 from scene_envs.grammars import get_grammar, list_grammars
 from scene_envs.physics import PhysicsPool, feasibility, make_ready
-from scene_envs.render import render, write_viewer
+from scene_envs.render import observe, render, write_viewer
 from tests.helpers.outside_package import installed
 
 DOCS = Path(__file__).parents[2] / "docs" / "grammars.md"
@@ -123,7 +123,7 @@ def test_physics_in_a_pool_is_physics_here(batch: SceneBatch) -> None:
 
 def test_pictures_have_its_colours_and_the_viewer_its_name(batch: SceneBatch, tmp_path: Path) -> None:
     library = batch.scene_type.library
-    image = render(batch[:1], style="semantic", width=160, height=120)[0]
+    image = observe(batch[:1], modes=["semantic"])[0]["semantic"][0]
     seen = {tuple(color) for color in image.reshape(-1, 3).tolist()}
     assert {library["cafe_table"].color, library["teapot"].color} <= seen
     assert seen <= {asset.color for asset in library} | {(255, 255, 255)}

@@ -106,6 +106,7 @@ SMALL_KEYS: dict[str, dict[str, str]] = {
     "search": {"budget": "2", "count": "2", "num_steps": "20", "slots": "13", "branching": "2"},
     "evaluate": {"count": "2", "num_steps": "20", "training_scenes": "8", "prompt_count": "2", "workers": "0"},
     "export": {"count": "1", "num_steps": "20", "workers": "0"},
+    "render": {"count": "1"},
     "view": {"count": "2", "num_steps": "3", "first": "0", "open": "false"},
     "import-checkpoint": {"count": "1", "num_steps": "2"},
     "benchmarks.paper_tables": {

@@ -16,7 +16,7 @@ import trimesh
 
 from scene_envs.assets import Asset, AssetLibrary, import_report, load_library
 from scene_envs.physics import PhysicsPool, feasibility, penetration
-from scene_envs.render import render
+from scene_envs.render import observe
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, FixedObject, SceneType, register_scene_type
 
@@ -216,7 +216,7 @@ def test_a_scene_type_travels_to_other_processes_with_its_folder(scene_type: Sce
 
 def test_pictures_show_imported_objects_in_their_colors(scene_type: SceneType) -> None:
     batch = scene(scene_type, [("mug", (0.0, 0.25, 0.0), 1.0), ("jenga", (0.0, 0.0, 0.0), 0.0)])
-    image = render(batch, style="semantic")[0]
+    image = observe(batch, modes=["semantic"])[0]["semantic"][0]
     found = {tuple(color) for color in np.unique(image.reshape(-1, 3), axis=0).tolist()}
     assert found == {(255, 255, 255), *(scene_type.library[name].color for name in ("cafe_table", "mug", "jenga"))}
     area = (image == scene_type.library["jenga"].color).all(axis=-1).sum()

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from scene_envs.render import Pinhole
 from tests.helpers.small_runs import one_quick_classifier, scenes_drawn_once
 
 
@@ -26,11 +27,11 @@ def _blank_curves(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 def _blank_scenes(request: pytest.FixtureRequest, _coarse_pictures: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Scenes of reports are blank, but for those of the demonstration."""
     if "demonstration" not in request.node.name:
-        monkeypatch.setattr("scene_envs.render.pictures._picture", _blank_picture)
+        monkeypatch.setattr("scene_envs.render.pictures.draw_picture", _blank_picture)
 
 
-def _blank_picture(stage: object, camera: object, width: int, height: int, *scene: object) -> NDArray[np.uint8]:
-    return np.zeros((height, width, 3), np.uint8)
+def _blank_picture(stage: object, camera: Pinhole, *scene: object) -> NDArray[np.uint8]:
+    return np.zeros((camera.height, camera.width, 3), np.uint8)
 
 
 def _blank(history: object, path: Path, **_: object) -> Path:

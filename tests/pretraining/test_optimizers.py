@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from agents.pretraining.optimizers import MuonAdamW, build_optimizer, orthogonalised
+from agents.pretraining.settings import PretrainOptimizerSettings
 from scene_envs.errors import UnknownNameError
 
 
@@ -95,4 +96,4 @@ def test_a_text_encoder_has_a_share_of_the_learning_rate(name: str) -> None:
 
 def test_an_unknown_optimizer_is_named() -> None:
     with pytest.raises(UnknownNameError, match="muon"):
-        build_optimizer("mion", nn.Linear(2, 2), 0.0)
+        PretrainOptimizerSettings("mion")

@@ -418,7 +418,7 @@ def test_a_run_of_no_steps_says_so(tmp_path: Path, capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("keys", "told"),
     [
-        ({"process": {"noise": {"ceiling": float("inf")}}}, "ceiling=inf must be a finite number"),
+        ({"process": {"noise": {"ceiling": float("inf")}}}, "ceiling=inf must be a positive number"),
         ({"loss": {"noise": {"mean": 500.0}}}, "lie outside the schedule"),
     ],
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,31 +11,35 @@ import trimesh
 
 from scene_envs.assets import get_library
 from scene_envs.errors import InvalidInputError
-from scene_envs.render.raster import Pinhole, corner_weights, visible_triangles
+from scene_envs.render.raster import Pinhole, visible_triangles
 from scene_envs.render.stage import Stage
-from scene_envs.scene_types import Camera
 
-ALONG = Pinhole.at((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 90.0, 200, 100)
-"""Looks along -z of the camera frame with focal length 50 pixels: its frame is the world's."""
+ALONG = Pinhole(np.eye(4), 50.0, 50.0, 100.0, 50.0, 200, 100)
+"""Looks along z with x right and y down: its frame is the world's."""
 
 
 def rays(camera):
     """(H, W, 3): the points at depth 1 in the middle of each pixel, camera frame."""
-    x = ((np.arange(camera.width) + 0.5) * 2.0 / camera.width - 1.0) / camera.focal[0]
-    y = (1.0 - (np.arange(camera.height) + 0.5) * 2.0 / camera.height) / camera.focal[1]
-    return np.stack([*np.meshgrid(x, y), np.full((camera.height, camera.width), -1.0)], axis=-1)
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    return np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], axis=-1)
+
+
+def visible(triangles, camera=ALONG):
+    """What the camera sees of triangles (T, 3, 3) in its frame."""
+    return visible_triangles(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), camera)
 
 
 def test_a_sphere_covers_the_disc_that_its_tangent_cone_cuts():
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=0.5)
-    faces, depth = visible_triangles(sphere.triangles + np.array([0.0, 0.0, -2.0]), ALONG)
+    faces, depth = visible(sphere.triangles + np.array([0.0, 0.0, 2.0]))
     radius = 50.0 * 0.5 / np.sqrt(2.0**2 - 0.5**2)  # pixels
     rows, columns = np.indices(faces.shape) + 0.5
     distance = np.hypot(columns - 100.0, rows - 50.0)
     assert (faces[distance < radius - 0.1] >= 0).all()
     assert (faces[distance > radius] == -1).all()
     slope = rays(ALONG)
-    square = (slope**2).sum(axis=-1)  # |t d - c| = r with c = (0, 0, -2)
+    square = (slope**2).sum(axis=-1)  # |t d - c| = r with c = (0, 0, 2)
     with np.errstate(invalid="ignore"):
         expected = (2.0 - np.sqrt(4.0 - square * (4.0 - 0.25))) / square
     inner = distance < 0.95 * radius
@@ -43,7 +49,7 @@ def test_a_sphere_covers_the_disc_that_its_tangent_cone_cuts():
 
 def test_a_box_covers_the_rectangle_of_its_front():
     box = trimesh.creation.box((0.8, 0.4, 0.2))
-    faces, depth = visible_triangles(box.triangles + np.array([0.1, 0.0, -1.1]), ALONG)
+    faces, depth = visible(box.triangles + np.array([0.1, 0.0, 1.1]))
     expected = np.zeros((100, 200), dtype=bool)
     expected[40:60, 85:125] = True  # 50 pixels x (-0.3 ... 0.5, -0.2 ... 0.2), front at 1 m
     np.testing.assert_array_equal(faces >= 0, expected)
@@ -51,12 +57,12 @@ def test_a_box_covers_the_rectangle_of_its_front():
 
 
 def test_a_floor_that_passes_under_the_camera_is_seen_up_to_the_horizon():
-    """The plane y = -1.5, whose triangles reach behind the camera: depth 1.5 / slope below the middle row."""
-    a, b, c, d = ([x, -1.5, z] for x, z in ((-1e4, 1e4), (1e4, 1e4), (1e4, -1e4), (-1e4, -1e4)))
-    faces, depth = visible_triangles(np.array([[a, b, c], [a, c, d]]), ALONG)
+    """The plane y = 1.5, whose triangles reach behind the camera: depth 1.5 / slope below the middle row."""
+    a, b, c, d = ([x, 1.5, z] for x, z in ((-1e4, 1e4), (1e4, 1e4), (1e4, -1e4), (-1e4, -1e4)))
+    faces, depth = visible(np.array([[a, b, c], [a, c, d]]))
     assert (faces[:50] == -1).all()
     assert (faces[50:] >= 0).all()
-    np.testing.assert_allclose(depth[50:], np.tile(1.5 / -rays(ALONG)[50:, :1, 1], (1, 200)), rtol=1e-5)
+    np.testing.assert_allclose(depth[50:], np.tile(1.5 / rays(ALONG)[50:, :1, 1], (1, 200)), rtol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -66,30 +72,33 @@ def test_neighbours_leave_no_gap_and_do_not_overlap(seed):
     from scipy.spatial import Delaunay
 
     flat = np.concatenate([rng.uniform(-9.0, 9.0, (800, 2)), [[-9, -9], [-9, 9], [9, -9], [9, 9]]])
-    points = np.column_stack([flat, -3.0 + 0.2 * flat[:, 0]])
+    points = np.column_stack([flat, 3.0 - 0.2 * flat[:, 0]])
     triangles = points[Delaunay(flat).simplices]
-    faces, depth = visible_triangles(triangles, ALONG)
+    faces, depth = visible(triangles)
     slope = rays(ALONG)
     inside = np.abs(slope[..., 0] * depth) < 8.9
     expected = 3.0 / (1.0 + 0.2 * slope[..., 0])
     assert inside.sum() > 15_000
     assert (faces[inside] >= 0).all()
     np.testing.assert_allclose(depth[inside], expected[inside], rtol=1e-5)
-    single = np.concatenate([visible_triangles(triangles[k::7], ALONG)[0].ravel() for k in range(7)])
+    single = np.concatenate([visible(triangles[k::7])[0].ravel() for k in range(7)])
     assert (single >= 0).sum() == (faces >= 0).sum()  # each pixel belongs to one triangle
 
 
-def test_weights_give_the_visible_point_back():
-    rng = np.random.default_rng(1)
-    triangles = rng.uniform(-2.0, 2.0, (60, 3, 3)) - [0.0, 0.0, 1.5]  # some reach behind the camera
-    faces, depth = visible_triangles(triangles, ALONG)
-    rows, columns = np.nonzero(faces >= 0)
-    seen = faces[rows, columns]
-    assert len(np.unique(seen)) > 10
-    second, third = corner_weights(triangles, seen, rows, columns, ALONG).T[:, :, None]
-    a, b, c = np.moveaxis(triangles[seen], 1, 0)
-    expected = rays(ALONG)[rows, columns] * depth[rows, columns, None]
-    np.testing.assert_allclose(a + second * (b - a) + third * (c - a), expected, atol=2e-5)
+def test_colors_are_interpolated_in_the_triangle_and_not_in_the_image():
+    """Colours of corners that are linear in the place give the colour of the visible place, also in perspective."""
+    stage = Stage(("teapot",))
+    stage.place(np.zeros((1, 3)), np.eye(3)[None], np.zeros(1, dtype=np.int64))
+    stage._colors, stage._normals = 100.0 + 300.0 * stage._vertices, 0.0 * stage._normals
+    camera = Pinhole.at((0.2, -0.15, 0.2), (0.0, 0.0, 0.06), (0.0, 0.0, 1.0), 60.0, 96, 72)
+    frame = stage.look(camera)
+    rows, columns = np.nonzero(frame.faces >= 0)
+    assert len(rows) > 500
+    points = rays(camera)[rows, columns] * frame.depth[rows, columns, None]
+    faces = frame.faces[rows, columns]
+    color = stage.paint(camera, faces, points.astype(np.float32), stage.normals(camera), np.array([0.0, 0.0, 1.0]))
+    world = points @ camera.pose[:3, :3].T + camera.pose[:3, 3]
+    np.testing.assert_allclose(color, 0.70 * (100.0 + 300.0 * world), atol=0.02)
 
 
 def test_depths_are_those_of_rays_of_mujoco():
@@ -110,7 +119,7 @@ def test_depths_are_those_of_rays_of_mujoco():
     mujoco.mj_multiRay(model, data, position, unit, None, True, -1, geom, distance, None, len(lengths), 10.0)
     stage = Stage(("teapot",))
     stage.place(np.zeros((1, 3)), np.eye(3)[None], np.zeros(1, dtype=np.int64))
-    depth = stage.look(Camera(position, (0.0, 0.0, 0.06), (0.0, 0.0, 1.0), fov_y=25.0), 48, 36).depth.ravel()
+    depth = stage.look(camera).depth.ravel()
     hit = geom >= 0
     assert hit.sum() > 300
     assert (hit != np.isfinite(depth)).sum() <= 2  # rays through an edge of the outline
@@ -124,12 +133,15 @@ def test_a_turned_object_has_its_slot_and_its_light():
     stage = Stage(("book",))
     turn = np.diag([1.0, -1.0, -1.0])
     stage.place(np.array([[9.0, 9.0, 9.0], [0.0, 0.0, 0.0]]), np.stack([np.eye(3), turn]), np.array([1, 0]))
-    frame = stage.look(Camera((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), 40, 30)
+    camera = Pinhole.at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 45.0, 40, 30)
+    frame = stage.look(camera)
     assert set(np.unique(frame.slots)) == {-1, 1}
-    above, below = (stage.paint(frame, np.array(light)) for light in ((np.sqrt(3.0), 0.0, 1.0), (0.0, 0.0, -1.0)))
-    seen = frame.slots == 1
-    assert (above[~seen] == 0.0).all()
-    np.testing.assert_allclose(below[seen] / above[seen], 0.70 / (0.70 + 0.40 * 0.5), rtol=0.01)
+    rows, columns = np.nonzero(frame.slots == 1)
+    points = (rays(camera) * frame.depth[..., None])[rows, columns].astype(np.float32)
+    faces, normals = frame.faces[rows, columns], stage.normals(camera)
+    lights = np.array([[np.sqrt(3.0), 0.0, 1.0], [0.0, 0.0, -1.0]])
+    above, below = (stage.paint(camera, faces, points, normals, light) for light in lights)
+    np.testing.assert_allclose(below / above, 0.70 / (0.70 + 0.40 * 0.5), rtol=0.01)
 
 
 def test_a_camera_without_a_direction_is_refused():
@@ -137,3 +149,23 @@ def test_a_camera_without_a_direction_is_refused():
         Pinhole.at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 45.0, 4, 4)
     with pytest.raises(InvalidInputError, match="cannot look at"):
         Pinhole.at((0.0, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), 45.0, 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"fx": 0.0}, "a camera's fx=0.0 must be a positive number"),
+        ({"fy": -3.0}, "a camera's fy=-3.0 must be a positive number"),
+        ({"near": 0.0}, "a camera's near=0.0 must be a positive number"),
+        ({"cx": np.nan}, "a camera's cx=nan must be a finite number"),
+        ({"width": 0}, "a camera's width=0 must be at least 1"),
+        ({"pose": np.eye(3)}, r"\(4, 4\) rigid motion"),
+        ({"pose": np.diag([1.0, 1.0, -1.0, 1.0])}, "rigid motion"),
+        ({"pose": np.diag([2.0, 2.0, 2.0, 1.0])}, "rigid motion"),
+    ],
+)
+def test_impossible_cameras_are_refused(values, message):
+    with pytest.raises(InvalidInputError, match=message):
+        replace(ALONG, **values)
+    with pytest.raises(InvalidInputError, match="between 0 and 180 degrees, got fov_y=180"):
+        Pinhole.at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 180.0, 4, 4)

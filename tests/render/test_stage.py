@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 
 from scene_envs import scene_types
 from scene_envs.datasets import to_union
@@ -13,14 +14,13 @@ from scene_envs.render import picture_camera
 from scene_envs.render.raster import Pinhole
 from scene_envs.render.stage import (
     Frame,
-    camera_points,
     contact_shade,
     fit_camera,
     frame_scene_type,
     light_camera,
     scene_type_of_one,
     soft_shadow,
-    surface_normals,
+    winding_number,
 )
 from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type, union_scene_type
 
@@ -74,8 +74,10 @@ def test_the_support_is_seen_whole_and_fills_the_picture(name, width, height):
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_the_lamp_sees_everything_that_the_picture_shows(name):
     scene_type = get_scene_type(name)
-    places, depth = in_image(frame_scene_type(scene_type).points, light_camera(scene_type))
-    assert np.abs(places).max() < 1.0
+    camera = light_camera(scene_type)
+    x, y, depth = camera.pose[:3, :3].T @ (frame_scene_type(scene_type).points - camera.pose[:3, 3]).T
+    assert np.abs(2.0 * (camera.fx * x / depth + camera.cx) / camera.width - 1.0).max() < 1.0
+    assert np.abs(2.0 * (camera.fy * y / depth + camera.cy) / camera.height - 1.0).max() < 1.0
     assert (depth > 0).all()
 
 
@@ -152,37 +154,47 @@ def test_rooms_and_types_with_a_support_of_their_own_keep_their_view():
 
 
 def looking_down(height, depth):
-    """A frame of a camera ``height`` m above the origin, x right and y up, 90 degree field of view."""
-    view = np.eye(4)
-    view[2, 3] = -height
+    """A camera ``height`` m above the origin, 90 degree field of view, and the points that it sees at ``depth``."""
     depth = np.asarray(depth, dtype=np.float32)
+    rows, columns = depth.shape
+    pose = np.eye(4)
+    pose[:3] = [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, height]]
+    camera = Pinhole(pose, columns / 2, rows / 2, columns / 2, rows / 2, columns, rows)
     slots = np.where(np.isfinite(depth), 0, -1)
-    return Frame(depth, slots, slots, Pinhole(view, np.array([1.0, 1.0]), 0.01, *depth.shape[::-1]))
+    rays = camera.rays(np.arange(columns) + 0.5, np.arange(rows)[:, None] + 0.5)
+    return Frame(depth, slots, slots, camera), rays * np.where(np.isfinite(depth), depth, 0.0)[..., None]
 
 
-def test_points_of_a_plane_lie_in_it_and_span_the_field_of_view():
-    points = camera_points(looking_down(2.0, np.full((40, 40), 2.0)))
-    np.testing.assert_allclose(points[..., 2], -2.0)
-    np.testing.assert_allclose(points[0, 0, :2], [-1.95, 1.95], atol=1e-6)
-    np.testing.assert_allclose(points[-1, -1, :2], [1.95, -1.95], atol=1e-6)
+UP = np.array([0.0, 0.0, -1.0], dtype=np.float32)
+"""Normal of a floor in the frame of a camera that looks down."""
 
 
-def test_normals_of_a_plane_and_of_a_slope():
-    frame = looking_down(2.0, np.full((40, 40), 2.0))
-    np.testing.assert_allclose(surface_normals(frame), np.broadcast_to([0.0, 0.0, 1.0], (40, 40, 3)), atol=1e-6)
-    x = (np.arange(40) + 0.5) / 20 - 1.0
-    slope = 2.0 / (1.0 + 0.5 * x)  # depth of the plane z_camera = -(2 - 0.5 x_camera), seen through pixel x
-    normals = surface_normals(looking_down(2.0, np.tile(slope, (40, 1))))
-    expected = np.array([-0.5, 0.0, 1.0]) / np.sqrt(1.25)
-    np.testing.assert_allclose(normals, np.broadcast_to(expected, (40, 40, 3)), atol=2e-3)
+def test_rays_of_a_plane_lie_in_it_and_span_the_field_of_view():
+    frame, points = looking_down(2.0, np.full((40, 40), 2.0))
+    np.testing.assert_allclose(points[..., 2], 2.0)
+    world = points @ frame.camera.pose[:3, :3].T + frame.camera.pose[:3, 3]
+    np.testing.assert_allclose(world[0, 0], [-1.95, 1.95, 0.0], atol=1e-6)
+    np.testing.assert_allclose(world[-1, -1], [1.95, -1.95, 0.0], atol=1e-6)
+    np.testing.assert_allclose(frame.camera.view @ frame.camera.pose, np.eye(4), atol=1e-12)
+
+
+def test_a_camera_of_another_size_has_the_same_view():
+    frame, _ = looking_down(2.0, np.full((40, 40), 2.0))
+    place = np.array([0.3, -0.4, 0.5, 1.0])
+    for size in ((40, 40), (160, 80)):
+        camera = frame.camera.resized(*size)
+        x, y, z, _ = camera.view @ place
+        column, row = x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy
+        np.testing.assert_allclose([column / size[0], row / size[1]], [0.5 + 0.1, 0.5 + 0.4 / 3.0])
 
 
 def test_a_block_between_lamp_and_floor_shades_what_is_under_it_only():
     floor = np.full((80, 80), 2.0)
-    frame = looking_down(2.0, floor)
+    frame, points = looking_down(2.0, floor)
     lamp_depth = floor.copy()
     lamp_depth[30:50, 30:50] = 1.0  # the lamp stands at the camera and sees a block that the frame does not
-    shadow = soft_shadow(frame, looking_down(2.0, lamp_depth), surface_normals(frame))
+    light, _ = looking_down(2.0, lamp_depth)
+    shadow = soft_shadow(points.reshape(-1, 3) + 0.008 * UP, frame.camera, light, 0.004).reshape(80, 80)
     assert (shadow[34:46, 34:46] == 1.0).all()
     assert (shadow[:26] == 0.0).all()
     assert (shadow[:, 54:] == 0.0).all()
@@ -192,17 +204,28 @@ def test_a_block_between_lamp_and_floor_shades_what_is_under_it_only():
 def test_a_surface_does_not_shadow_itself_and_the_backdrop_stays_bright():
     depth = np.full((40, 40), 2.0)
     depth[:, :10] = np.inf
-    frame = looking_down(2.0, depth)
-    normals = surface_normals(frame)
-    assert (soft_shadow(frame, frame, normals) == 0.0).all()
-    assert (contact_shade(frame, normals)[:, :8] == 0.0).all()
+    frame, points = looking_down(2.0, depth)
+    assert (soft_shadow(points[:, 10:].reshape(-1, 3) + 0.008 * UP, frame.camera, frame, 0.004) == 0.0).all()
+    assert (contact_shade(points, np.broadcast_to(UP, points.shape), frame.camera)[:, :8] == 0.0).all()
 
 
 def test_corners_are_shaded_and_open_floor_is_not():
     depth = np.full((200, 200), 0.4)
     depth[:, 100:] = 0.36  # a step 4 cm high
-    frame = looking_down(0.4, depth)
-    shade = contact_shade(frame, surface_normals(frame))
+    frame, points = looking_down(0.4, depth)
+    shade = contact_shade(points, np.broadcast_to(UP, points.shape), frame.camera)
     assert shade[100, 94:98].mean() > 0.05
     assert shade[100, :60].max() < 1e-3
     assert shade[100, 104:].max() < 1e-3
+
+
+def test_the_winding_number_counts_how_often_a_surface_encloses_a_point():
+    box = trimesh.creation.box((1.0, 2.0, 3.0)).triangles
+    inside, outside = np.array([0.3, -0.9, 1.2]), np.array([0.6, 0.0, 0.0])
+    assert winding_number(box, inside) == pytest.approx(1.0)
+    assert winding_number(box, outside) == pytest.approx(0.0, abs=1e-12)
+    assert winding_number(box[:, ::-1], inside) == pytest.approx(-1.0)
+    assert winding_number(np.concatenate([box, box]), inside) == pytest.approx(2.0)
+    cube = trimesh.creation.box((1.0, 1.0, 1.0))
+    half = cube.triangles[cube.face_normals[:, 2] < 0.5]  # without its top, a sixth of what its middle sees
+    assert winding_number(half, np.zeros(3)) == pytest.approx(5.0 / 6.0)

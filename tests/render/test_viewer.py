@@ -16,11 +16,11 @@ from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
-from scene_envs.render import write_viewer
+from scene_envs.render import Pinhole, write_viewer
 from scene_envs.render.stage import get_stage
 from scene_envs.rotations import matrix_to_quaternion, yaw_matrix
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import Camera, get_scene_type
+from scene_envs.scene_types import get_scene_type
 
 DIMSUM = get_scene_type("dimsum_table")
 
@@ -149,11 +149,11 @@ def test_a_browser_draws_the_objects_where_they_are(browser, tmp_path):
     a, e = np.radians([-40.0, 50.0])
     toward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     target = np.array([0.1, 0.0, 0.0])
-    camera = Camera(tuple(target + 3.5 * toward), tuple(target), (0.0, 0.0, 1.0), fov_y=28.0)
+    camera = Pinhole.at(tuple(target + 3.5 * toward), tuple(target), (0.0, 0.0, 1.0), 28.0, width, height)
     stage = get_stage(DIMSUM.assets)
     poses = (part[2].double().numpy() for part in (batch.translations, batch.rotations))
     stage.place(*poses, batch.categories[2].numpy())
-    slots = stage.look(camera, width, height).slots
+    slots = stage.look(camera).slots
     for slot in (-1, 0, 3, 4, 5, 6):
         pixels, x, y = seen["sums"][str(slot)]
         rows, columns = np.nonzero(slots == slot)

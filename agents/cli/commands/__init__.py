@@ -19,6 +19,7 @@ COMMANDS = {
     "search": "search for scenes that score high, at inference time",
     "project": "make scenes simulation-ready: project out of penetration, then settle",
     "export": "write scenes for simulators and viewers: URDF, SDF, Drake, MJCF, USD, GLB, arrays",
+    "render": "write images of cameras in scenes: color, depth, masks, normals, and annotations as those of COCO",
     "view": "write a page that shows scenes in a browser: a dataset, samples, a prior or a grammar",
     "evaluate": "measure the samples of a prior against real scenes",
     "priors": "list the shipped priors",
