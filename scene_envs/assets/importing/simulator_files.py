@@ -1,0 +1,347 @@
+"""Readers of MJCF, by MuJoCo's own compiler, and of USD with UsdPhysics: one body at zero joint positions."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scene_envs.arrays import Array
+from scene_envs.assets.importing.limits import check_file, check_triangles
+from scene_envs.assets.importing.mesh_files import (
+    Y_UP,
+    Color,
+    Model,
+    Shape,
+    cut_polygons,
+    heavier,
+    merged_inertial,
+    moved_inertial,
+    pose_of,
+)
+from scene_envs.assets.importing.solids import solid_of
+from scene_envs.assets.shapes import MassProperties
+from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
+
+_LEFT_OUT = {
+    "nu": "actuators", "nsensor": "sensors", "ntendon": "tendons", "neq": "equality constraints", "nflex": "flexes",
+    "nskin": "skins",
+}  # fmt: skip
+"""What MuJoCo knows and an asset does not, by the size that counts it."""
+
+
+def read_mjcf(path: Path) -> Model:
+    """The one body of an MJCF file, with those below it, as MuJoCo compiles them, in the frame of that body; movable
+    joints are frozen at their reference. A body without a free joint is welded. Raises CorruptFileError for a file that
+    MuJoCo does not compile, and InvalidInputError for several bodies or none.
+    """
+    import mujoco
+
+    check_file(path)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        for mesh in spec.meshes:
+            check_file(path.parent / spec.meshdir / mesh.file)
+        model: Any = spec.compile()
+    except ValueError as error:
+        raise CorruptFileError(f"{path} cannot be read as MJCF: {' '.join(str(error).split())}") from error
+    data: Any = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    root = _root_body(model, path)
+    bodies = [body for body in range(model.nbody) if root in (0, int(model.body_rootid[body]))]
+    base = np.linalg.inv(pose_of(data.xpos[root], data.xmat[root].reshape(3, 3)))
+    visuals: list[Shape] = []
+    collisions: list[Shape] = []
+    notes: list[str] = []
+    for geom in range(model.ngeom):
+        name = f"geom {model.geom(geom).name or geom!r}"
+        if int(model.geom_bodyid[geom]) not in bodies:
+            notes.append(f"{name} of the world is left out")
+            continue
+        shape = _geom(model, geom, base @ pose_of(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)), path, name)
+        if shape is None:
+            notes.append(f"{name} is a {mujoco.mjtGeom(model.geom_type[geom]).name[7:].lower()}, which is left out")
+            continue
+        if collides := bool(model.geom_contype[geom] | model.geom_conaffinity[geom]):
+            collisions.append(shape)
+        if model.geom_group[geom] <= 2 or not collides:  # MuJoCo draws the groups 0 to 2
+            visuals.append(shape)
+    inertials = []
+    for body in bodies:
+        if model.body_mass[body] > 0:
+            pose = base @ pose_of(data.xipos[body], data.ximat[body].reshape(3, 3))
+            own = MassProperties(float(model.body_mass[body]), np.zeros(3), np.diag(model.body_inertia[body]))
+            inertials.append(moved_inertial(pose, own))
+    notes += [f"not read: {what} ({getattr(model, key)})" for key, what in _LEFT_OUT.items() if getattr(model, key)]
+    if len(np.unique(model.geom_friction, axis=0)) > 1 or (model.ngeom and model.geom_friction[0, 0] != 1.0):
+        notes.append("not read: friction of geoms, because all objects of a scene have the same")
+    if model.ntex:
+        notes.append(f"not read: {model.ntex} texture(s); surfaces with them have the colour of the asset")
+    free = [j for j in range(model.njnt) if model.jnt_type[j] == 0 and model.jnt_bodyid[j] == root]
+    held = [j for j in range(model.njnt) if j not in free and model.jnt_bodyid[j] in bodies]
+    if movable := [model.joint(j).name or f"joint {j}" for j in held]:
+        notes.append(f"movable joints frozen at zero: {', '.join(movable)}")
+    if not free:
+        notes.append("it has no free joint: it is welded (`welded: false` makes it free)")
+    return Model(tuple(visuals), tuple(collisions), tuple(inertials), None if free else True, tuple(notes))
+
+
+def _root_body(model: Any, path: Path) -> int:
+    """The one body on the world; the world itself where it holds all geoms."""
+    roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
+    if len(roots) > 1:
+        names = ", ".join(repr(model.body(body).name) for body in roots)
+        raise InvalidInputError(f"{path} holds {len(roots)} bodies ({names}); an asset is one, so put each in a file")
+    if not roots and not model.ngeom:
+        raise InvalidInputError(f"{path} holds no <body> and no <geom>")
+    return roots[0] if roots else 0
+
+
+def _geom(model: Any, geom: int, pose: Array, path: Path, name: str) -> Shape | None:
+    """A geom as MuJoCo takes it: meshes collide as their hulls."""
+    kind = int(model.geom_type[geom])
+    size = model.geom_size[geom].astype(float)
+    material = int(model.geom_matid[geom])
+    rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+    color: Color | None = tuple(np.rint(255.0 * rgba[:3]).astype(int).tolist())
+    if material >= 0 and (model.mat_texid[material] >= 0).any():
+        color = None
+    if kind == 7:
+        import trimesh
+
+        mesh = int(model.geom_dataid[geom])
+        points, faces = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
+        check_triangles(path, int(model.mesh_facenum[mesh]))
+        surface = trimesh.Trimesh(
+            model.mesh_vert[points : points + model.mesh_vertnum[mesh]].astype(float),
+            model.mesh_face[faces : faces + model.mesh_facenum[mesh]],
+            process=False,
+        )
+        return Shape("mesh", (1.0, 1.0, 1.0), pose, name, path, color, True, surface=surface)
+    sizes: dict[int, tuple[Any, tuple[float, ...]]] = {
+        2: ("sphere", (size[0],)), 3: ("capsule", (size[0], 2 * size[1])), 4: ("ellipsoid", tuple(size)),
+        5: ("cylinder", (size[0], 2 * size[1])), 6: ("box", tuple(2 * size)),
+    }  # fmt: skip
+    return Shape(*sizes[kind], pose, name, None, color) if kind in sizes else None
+
+
+def used_layers(path: Path) -> set[Path]:
+    """The files that a USD file brings in; empty where it, or usd-core, cannot be read."""
+    try:
+        from pxr import Tf, Usd
+    except ImportError:
+        return set()
+    try:
+        layers = Usd.Stage.Open(str(path)).GetUsedLayers()
+    except Tf.ErrorException:
+        return set()
+    return {Path(layer.realPath).resolve() for layer in layers if layer.realPath} - {path.resolve()}
+
+
+def read_usd(path: Path) -> Model:
+    """The body in a USD file with UsdPhysics, in the frame of the stage, with z up, in metres. Colliders without a
+    rigid body are welded; a stage without physics is a mesh. Raises MissingDependencyError without usd-core,
+    CorruptFileError for a file that cannot be composed, and InvalidInputError for one that does not state its unit, or
+    holds several bodies that no joint connects, no geometry, or shapes that are sheared.
+    """
+    try:
+        from pxr import Tf, Usd, UsdGeom, UsdPhysics
+    except ImportError as error:
+        raise MissingDependencyError(f"{path} needs usd-core; `pip install 'scene-envs[export]'`") from error
+    check_file(path)
+    try:
+        stage: Any = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise CorruptFileError(f"{path} cannot be read as USD: {' '.join(str(error).split())[:300]}") from error
+    if lost := [" ".join(str(error).split()) for error in stage.GetCompositionErrors()]:
+        raise CorruptFileError(f"{path} refers to what cannot be loaded: {lost[0][:300]}")
+    for used in used_layers(path):
+        check_file(used)
+    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        raise InvalidInputError(f"{path} does not state `metersPerUnit`; set it, 1 for metres or 0.01 for centimetres")
+    unit, kilograms = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
+    turn = Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else np.eye(3)
+    reading = _Stage(path, unit, kilograms, turn)
+    prims = [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()) if prim.IsActive()]
+    bodies = [prim for prim in prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
+    joints = [prim for prim in prims if prim.IsA(UsdPhysics.Joint)]
+    if len(bodies) > 1 and not joints:
+        names = ", ".join(str(prim.GetPath()) for prim in bodies)
+        raise InvalidInputError(f"{path} holds {len(bodies)} bodies ({names}); an asset is one, so put each in a file")
+    for prim in prims:
+        if prim.IsA(UsdGeom.Gprim):
+            reading.add(prim)
+    for body in bodies:
+        reading.weigh(body)
+    notes = list(dict.fromkeys(reading.notes))
+    movable = [prim.GetName() for prim in joints if not prim.IsA(UsdPhysics.FixedJoint)]
+    if movable:
+        notes.append(f"movable joints frozen where they are: {', '.join(movable)}")
+    ends = [[UsdPhysics.Joint(prim).GetBody0Rel(), UsdPhysics.Joint(prim).GetBody1Rel()] for prim in joints]
+    held = any(not end.GetTargets() for pair in ends for end in pair)
+    static = True if held or (reading.collisions and not bodies) else None
+    if static:
+        why = "a joint holds it at the world" if held else "it has colliders and no rigid body"
+        notes.append(f"{why}: it is welded (`welded: false` makes it free)")
+    collisions = tuple(shape for _, shape in reading.collisions)
+    return Model(tuple(reading.visuals), collisions, tuple(reading.inertials), static, tuple(notes))
+
+
+class _Stage:
+    """What was read of the prims of a stage, in metres, kilograms and z up."""
+
+    def __init__(self, path: Path, unit: float, kilograms: float, turn: Array) -> None:
+        self.path, self.unit, self.kilograms, self.turn = path, unit, kilograms, turn
+        self.notes: list[str] = []
+        self.visuals: list[Shape] = []
+        self.collisions: list[tuple[Any, Shape]] = []  # with their prims
+        self.inertials: list[MassProperties] = []
+
+    def _matrix(self, prim: Any) -> tuple[Array, Array]:
+        """(3, 3) and (3,) m that take coordinates of a prim, in its unit, to the model frame."""
+        from pxr import UsdGeom
+
+        rows = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0.0))
+        return self.unit * self.turn @ rows[:3, :3].T, self.unit * self.turn @ rows[3, :3]
+
+    def add(self, prim: Any) -> None:
+        """Read a shape as a visual, a collider or both."""
+        from pxr import UsdGeom, UsdPhysics
+
+        owner = next((p for p in _and_above(prim) if p.HasAPI(UsdPhysics.CollisionAPI)), None)
+        collides = owner is not None and UsdPhysics.CollisionAPI(owner).GetCollisionEnabledAttr().Get() is not False
+        image = UsdGeom.Imageable(prim)
+        drawn = image.ComputePurpose() in ("default", "render") and image.ComputeVisibility() != "invisible"
+        if not collides and not drawn:
+            return
+        shape = self._shape(prim, owner)
+        if shape is None:
+            self.notes.append(f"{prim.GetPath()} is a {prim.GetTypeName()}, which is left out")
+            return
+        if collides:
+            self.collisions.append((prim, shape))
+        if drawn:
+            self.visuals.append(shape)
+
+    def _shape(self, prim: Any, owner: Any) -> Shape | None:
+        import trimesh
+        from pxr import UsdGeom, UsdPhysics
+
+        where, color = str(prim.GetPath()), self._color(prim)
+        matrix, place = self._matrix(prim)
+        if prim.IsA(UsdGeom.Mesh):
+            mesh = UsdGeom.Mesh(prim)
+            corners, counts = (np.array(a.Get() or (), dtype=np.int64) for a in (
+                mesh.GetFaceVertexIndicesAttr(), mesh.GetFaceVertexCountsAttr()
+            ))  # fmt: skip
+            points = np.array(mesh.GetPointsAttr().Get() or (), dtype=np.float64).reshape(-1, 3)
+            if counts.sum() != len(corners) or not len(points) or not 0 <= corners.min() <= corners.max() < len(points):
+                raise CorruptFileError(f"{self.path}: the faces of {where} do not fit to its points")
+            if mesh.GetHoleIndicesAttr().Get():
+                self.notes.append(f"{where}: its holes are filled")
+            rows = corners[cut_polygons(points, corners, counts)[0]]
+            check_triangles(self.path, len(rows))
+            inside_out = (mesh.GetOrientationAttr().Get() == "leftHanded") != (np.linalg.det(matrix) < 0)
+            surface = trimesh.Trimesh(points @ matrix.T + place, rows[:, :: -1 if inside_out else 1], process=False)
+            how = UsdPhysics.MeshCollisionAPI(owner or prim).GetApproximationAttr().Get() if owner else None
+            is_hull = how in ("convexHull", "boundingCube", "boundingSphere")
+            if how in ("boundingCube", "boundingSphere"):
+                self.notes.append(f"{where}: its {how} is taken as its hull")
+            return Shape("mesh", (1.0,) * 3, np.eye(4), where, self.path, color, is_hull, surface=surface)
+        scales = np.linalg.norm(matrix, axis=0)
+        turn = matrix / scales
+        if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-6:
+            raise InvalidInputError(f"{self.path}: {where} is sheared; make it a mesh")
+        turn = turn * np.sign(np.linalg.det(turn))  # primitives look the same in a mirror
+        get = partial(_number, prim)
+        if prim.IsA(UsdGeom.Cube):
+            return Shape("box", tuple(get("size") * scales), pose_of(place, turn), where, None, color)
+        if prim.IsA(UsdGeom.Sphere):
+            return Shape("ellipsoid", tuple(get("radius") * scales), pose_of(place, turn), where, None, color)
+        kind = "cylinder" if prim.IsA(UsdGeom.Cylinder) else "capsule" if prim.IsA(UsdGeom.Capsule) else ""
+        if not kind:
+            return None
+        order = np.roll(np.arange(3), -"XYZ".index(prim.GetAttribute("axis").Get()) - 1)  # the axis last
+        scales, turn = scales[order], turn[:, order]
+        even = scales[:2] if kind == "cylinder" else scales
+        if np.ptp(even) > 1e-6 * scales.max():
+            raise InvalidInputError(f"{self.path}: {where} is scaled unevenly; make it a mesh")
+        size = (float(get("radius") * scales[0]), float(get("height") * scales[2]))
+        return Shape(kind, size, pose_of(place, turn), where, None, color)  # type: ignore[arg-type]
+
+    def _color(self, prim: Any) -> Color | None:
+        """The constant colour of a prim, from the linear one of the file."""
+        from pxr import UsdGeom, UsdShade
+
+        values = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
+        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        for shader in material.GetPrim().GetChildren() if material else ():
+            diffuse = shader.GetAttribute("inputs:diffuseColor")
+            if diffuse and diffuse.HasAuthoredValue() and not diffuse.HasAuthoredConnections():
+                values = [diffuse.Get()]
+            if shader.GetAttribute("inputs:file"):
+                self.notes.append(f"not read: the textures of {material.GetPath()}")
+        if material and material.GetPrim().GetAttribute("physics:dynamicFriction").HasAuthoredValue():
+            self.notes.append("not read: friction of materials, because all objects of a scene have the same")
+        if not values:
+            return None
+        linear = np.clip(np.mean(values, axis=0), 0.0, 1.0)
+        if len(np.unique(np.array(values), axis=0)) > 1:
+            self.notes.append(f"{prim.GetPath()}: its {len(values)} colours are drawn as their mean")
+        shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        red, green, blue = np.rint(255.0 * shown).astype(int).tolist()
+        return (red, green, blue)
+
+    def weigh(self, body: Any) -> None:
+        """Mass properties of a body by the rules of UsdPhysics: its own, else those of its colliders."""
+
+        matrix, place = self._matrix(body)
+        mass, center, moments, axes = (body.GetAttribute(f"physics:{key}").Get() for key in _MASS)
+        turn = matrix / np.linalg.norm(matrix, axis=0)
+        filled: MassProperties | None = None
+        own = [(p, s) for p, s in self.collisions if body in _and_above(p)]
+        has_center = center is not None and np.isfinite(center).all()
+        if own and not (mass and has_center and moments and any(moments)):
+            solids = []
+            for prim, shape in own:
+                solid = solid_of(shape)
+                density = _number(prim, "physics:density") or _number(body, "physics:density")
+                weight = _number(prim, "physics:mass") * self.kilograms
+                per_volume = (density or 0.0) * self.kilograms / self.unit**3 or 1000.0
+                solids.append(heavier(solid, weight / solid.mass if weight else per_volume))
+            filled = merged_inertial(solids)
+        kilograms = (mass or 0.0) * self.kilograms or (filled.mass if filled else 0.0)
+        if not kilograms:
+            self.notes.append(f"{body.GetPath()} has neither mass nor colliders")
+            return
+        if filled is not None:
+            filled = heavier(filled, kilograms / filled.mass)
+        middle = matrix @ np.array(center) + place if has_center else filled.center_of_mass if filled else place
+        if moments and any(moments):
+            quaternion = [*axes.GetImaginary(), axes.GetReal()] if axes and axes.GetLength() else [0.0, 0.0, 0.0, 1.0]
+            frame = turn @ Rotation.from_quat(quaternion).as_matrix()
+            inertia = (frame * np.array(moments) * self.kilograms * self.unit**2) @ frame.T
+        else:
+            inertia = filled.inertia if filled else np.zeros((3, 3))
+        self.inertials.append(MassProperties(float(kilograms), middle, inertia))
+
+
+_MASS = ("mass", "centerOfMass", "diagonalInertia", "principalAxes")
+
+
+def _number(prim: Any, name: str) -> float:
+    """A number of a prim; 0 where it has none."""
+    value = prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None
+    return float(value or 0.0)
+
+
+def _and_above(prim: Any) -> list[Any]:
+    """The prim and those above it."""
+    found = []
+    while prim and not prim.IsPseudoRoot():
+        found.append(prim)
+        prim = prim.GetParent()
+    return found
