@@ -108,3 +108,108 @@ def test_a_cabinet_is_one_body_as_mujoco_weighs_it(tmp_path: Path) -> None:
 def test_mjcf_that_is_no_asset_is_refused(tmp_path: Path, text: str, error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         listed(tmp_path, "it.xml", text)
+
+
+def test_our_usd_comes_back(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    ours = exported(tmp_path / "out", "usd")
+    (scene,) = (tmp_path / "out").rglob("scene*.usda")
+    for name, asset in ours.items():
+        reference = f"""def "it" (prepend references = @{scene}@</World/{name}_0>) {{}}"""
+        head = '#usda 1.0\n(\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'
+        (tmp_path / "it.usda").write_text(head + reference)
+        assert_same(listed(tmp_path, "it.usda", keys=", base: origin"), asset)
+
+
+def usd(geometry: str, body: str = "", head: str = 'metersPerUnit = 1\n    upAxis = "Z"', rest: str = "") -> str:
+    return f"""#usda 1.0
+(
+    {head}
+)
+def Xform "it" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"])
+{{
+    {body}
+    {geometry}
+}}
+{rest}
+"""
+
+
+CUBE = """def Cube "box" (prepend apiSchemas = ["PhysicsCollisionAPI", "PhysicsMassAPI"])
+    {{
+        double size = 2
+        double3 xformOp:scale = (0.1, 0.05, 0.02)
+        uniform token[] xformOpOrder = ["xformOp:scale"]
+        {}
+    }}"""
+BOX = np.array([0.2, 0.1, 0.04])
+
+
+def box_moments(mass: float) -> np.ndarray:
+    return mass / 12 * ((BOX**2).sum() - BOX**2)
+
+
+@pytest.mark.parametrize(
+    ("body", "collider", "mass"),
+    [
+        ("", "", 0.8),  # the default density of UsdPhysics, 1000 kg/m3
+        ("float physics:density = 500", "", 0.4),
+        ("float physics:density = 500", "float physics:density = 250", 0.2),
+        ("float physics:density = 500", "float physics:mass = 3", 3.0),
+        ("float physics:mass = 7", "float physics:mass = 3", 7.0),
+    ],
+)
+def test_masses_of_usd_have_the_precedence_of_the_schema(tmp_path: Path, body: str, collider: str, mass: float) -> None:
+    pytest.importorskip("pxr")
+    asset = listed(tmp_path, "it.usda", usd(CUBE.format(collider), body))
+    assert asset.mass == pytest.approx(mass, rel=1e-6)
+    np.testing.assert_allclose(np.diag(asset.inertia), box_moments(mass), rtol=1e-6)
+
+
+def test_units_up_axis_and_principal_axes_of_usd(tmp_path: Path) -> None:
+    """In centimetres, y up: the box lies with its y side up, and the inertia turns with it."""
+    pytest.importorskip("pxr")
+    body = """float physics:mass = 2
+    point3f physics:centerOfMass = (1, 0.5, 0)
+    float3 physics:diagonalInertia = (20, 60, 70)
+    quatf physics:principalAxes = (0.70710678, 0, 0, 0.70710678)"""
+    cube = CUBE.format("").replace("(0.1, 0.05, 0.02)", "(10, 5, 2)")
+    text = usd(cube, body, 'metersPerUnit = 0.01\n    upAxis = "Y"')
+    asset = listed(tmp_path, "it.usda", text, ", base: origin")
+    np.testing.assert_allclose(asset.bounds[1] - asset.bounds[0], [0.2, 0.04, 0.1], atol=1e-6)
+    np.testing.assert_allclose(asset.center_of_mass, [0.01, 0, 0.005], atol=1e-8)
+    np.testing.assert_allclose(asset.inertia, np.diag([60e-4, 70e-4, 20e-4]), atol=1e-8)
+
+
+def test_what_usd_does_not_say_or_hold_is_refused_or_named(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    with pytest.raises(InvalidInputError, match="does not state `metersPerUnit`"):
+        listed(tmp_path, "it.usda", usd(CUBE.format(""), head='upAxis = "Y"'))
+    with pytest.raises(CorruptFileError, match="cannot be loaded"):
+        listed(tmp_path, "it.usda", usd('def "lost" (references = @lost.usda@) {}'))
+    with pytest.raises(CorruptFileError, match="cannot be read as USD"):
+        listed(tmp_path, "it.usda", "no stage")
+    second = 'def Cube "b" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI"]) {}'
+    with pytest.raises(InvalidInputError, match="2 bodies"):
+        listed(tmp_path, "it.usda", usd(CUBE.format(""), rest=second))
+    hinge = """def PhysicsRevoluteJoint "hinge"
+{
+    rel physics:body0 = </it>
+    rel physics:body1 = </b>
+}"""
+    asset = listed(tmp_path, "it.usda", usd(CUBE.format(""), rest=f"{second}\n{hinge}"))
+    assert asset.mass == pytest.approx(0.8 + 8000)
+    assert "movable joints frozen where they are: hinge" in said(tmp_path)
+
+
+def test_a_file_that_mujoco_wrote_is_read(tmp_path: Path) -> None:
+    """``usd_golden.usda`` of MuJoCo's test data, against the numbers in it."""
+    pytest.importorskip("pxr")
+    file = Path(mujoco.__file__).parent / "testdata" / "usd_golden.usda"
+    if not file.is_file():
+        pytest.skip("this MuJoCo has no test data")
+    with pytest.raises(InvalidInputError, match="metersPerUnit"):
+        listed(tmp_path, "it.usda", file.read_text())
+    text = file.read_text().replace('upAxis = "Z"', 'upAxis = "Z"\n    metersPerUnit = 1', 1)
+    asset = listed(tmp_path, "it.usda", text)
+    print(asset.mass, asset.bounds, said(tmp_path))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from scene_envs.assets.importing.limits import check_file, check_triangles
 from scene_envs.assets.importing.mesh_files import (
     Y_UP,
     Color,
+    Kind,
     Model,
     Shape,
     cut_polygons,
@@ -128,46 +128,38 @@ def _geom(model: Any, geom: int, pose: Array, path: Path, name: str) -> Shape | 
     return Shape(*sizes[kind], pose, name, None, color) if kind in sizes else None
 
 
-def used_layers(path: Path) -> set[Path]:
-    """The files that a USD file brings in; empty where it, or usd-core, cannot be read."""
+def open_stage(path: Path) -> Any:
+    """The stage of a USD file; MissingDependencyError without usd-core, CorruptFileError for what is no USD."""
     try:
         from pxr import Tf, Usd
-    except ImportError:
-        return set()
-    try:
-        layers = Usd.Stage.Open(str(path)).GetUsedLayers()
-    except Tf.ErrorException:
-        return set()
-    return {Path(layer.realPath).resolve() for layer in layers if layer.realPath} - {path.resolve()}
-
-
-def read_usd(path: Path) -> Model:
-    """The body in a USD file with UsdPhysics, in the frame of the stage, with z up, in metres. Colliders without a
-    rigid body are welded; a stage without physics is a mesh. Raises MissingDependencyError without usd-core,
-    CorruptFileError for a file that cannot be composed, and InvalidInputError for one that does not state its unit, or
-    holds several bodies that no joint connects, no geometry, or shapes that are sheared.
-    """
-    try:
-        from pxr import Tf, Usd, UsdGeom, UsdPhysics
     except ImportError as error:
         raise MissingDependencyError(f"{path} needs usd-core; `pip install 'scene-envs[export]'`") from error
     check_file(path)
     try:
         stage: Any = Usd.Stage.Open(str(path))
+        stage.Reload()  # a layer that this process has open is not read again
     except Tf.ErrorException as error:
         raise CorruptFileError(f"{path} cannot be read as USD: {' '.join(str(error).split())[:300]}") from error
+    return stage
+
+
+def read_usd(path: Path) -> Model:
+    """The body in a USD file with UsdPhysics, in the frame of the stage, z up, in metres. Colliders without a rigid
+    body are welded; a stage without physics is a mesh. Raises MissingDependencyError without usd-core, CorruptFileError
+    for a file that cannot be composed, and InvalidInputError for one that does not state its unit, or holds several
+    bodies that no joint connects, or shapes that are sheared.
+    """
+    stage = open_stage(path)
+    from pxr import Usd, UsdGeom, UsdPhysics
+
     if lost := [" ".join(str(error).split()) for error in stage.GetCompositionErrors()]:
         raise CorruptFileError(f"{path} refers to what cannot be loaded: {lost[0][:300]}")
-    for used in used_layers(path):
-        check_file(used)
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         raise InvalidInputError(f"{path} does not state `metersPerUnit`; set it, 1 for metres or 0.01 for centimetres")
-    unit, kilograms = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
-    turn = Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else np.eye(3)
-    reading = _Stage(path, unit, kilograms, turn)
+    reading = _Stage(path, stage)
     prims = [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()) if prim.IsActive()]
     bodies = [prim for prim in prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
-    joints = [prim for prim in prims if prim.IsA(UsdPhysics.Joint)]
+    joints = [UsdPhysics.Joint(prim) for prim in prims if prim.IsA(UsdPhysics.Joint)]
     if len(bodies) > 1 and not joints:
         names = ", ".join(str(prim.GetPath()) for prim in bodies)
         raise InvalidInputError(f"{path} holds {len(bodies)} bodies ({names}); an asset is one, so put each in a file")
@@ -177,11 +169,9 @@ def read_usd(path: Path) -> Model:
     for body in bodies:
         reading.weigh(body)
     notes = list(dict.fromkeys(reading.notes))
-    movable = [prim.GetName() for prim in joints if not prim.IsA(UsdPhysics.FixedJoint)]
-    if movable:
+    if movable := [j.GetPrim().GetName() for j in joints if not j.GetPrim().IsA(UsdPhysics.FixedJoint)]:
         notes.append(f"movable joints frozen where they are: {', '.join(movable)}")
-    ends = [[UsdPhysics.Joint(prim).GetBody0Rel(), UsdPhysics.Joint(prim).GetBody1Rel()] for prim in joints]
-    held = any(not end.GetTargets() for pair in ends for end in pair)
+    held = any(not end.GetTargets() for joint in joints for end in (joint.GetBody0Rel(), joint.GetBody1Rel()))
     static = True if held or (reading.collisions and not bodies) else None
     if static:
         why = "a joint holds it at the world" if held else "it has colliders and no rigid body"
@@ -193,9 +183,13 @@ def read_usd(path: Path) -> Model:
 class _Stage:
     """What was read of the prims of a stage, in metres, kilograms and z up."""
 
-    def __init__(self, path: Path, unit: float, kilograms: float, turn: Array) -> None:
-        self.path, self.unit, self.kilograms, self.turn = path, unit, kilograms, turn
-        self.notes: list[str] = []
+    def __init__(self, path: Path, stage: Any) -> None:
+        from pxr import UsdGeom, UsdPhysics
+
+        self.path, self.kilograms = path, UsdPhysics.GetStageKilogramsPerUnit(stage)
+        self.unit = UsdGeom.GetStageMetersPerUnit(stage)
+        self.axes = self.unit * (Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else np.eye(3))
+        self.notes = [] if stage.HasAuthoredMetadata("upAxis") else ["upAxis is not stated: y is up, as USD says"]
         self.visuals: list[Shape] = []
         self.collisions: list[tuple[Any, Shape]] = []  # with their prims
         self.inertials: list[MassProperties] = []
@@ -205,7 +199,7 @@ class _Stage:
         from pxr import UsdGeom
 
         rows = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0.0))
-        return self.unit * self.turn @ rows[:3, :3].T, self.unit * self.turn @ rows[3, :3]
+        return self.axes @ rows[:3, :3].T, self.axes @ rows[3, :3]
 
     def add(self, prim: Any) -> None:
         """Read a shape as a visual, a collider or both."""
@@ -217,66 +211,72 @@ class _Stage:
         drawn = image.ComputePurpose() in ("default", "render") and image.ComputeVisibility() != "invisible"
         if not collides and not drawn:
             return
-        shape = self._shape(prim, owner)
+        shape = self._mesh(prim, owner) if prim.IsA(UsdGeom.Mesh) else self._primitive(prim)
         if shape is None:
             self.notes.append(f"{prim.GetPath()} is a {prim.GetTypeName()}, which is left out")
-            return
-        if collides:
-            self.collisions.append((prim, shape))
-        if drawn:
-            self.visuals.append(shape)
+        else:
+            self.collisions += [(prim, shape)] if collides else []
+            self.visuals += [shape] if drawn else []
 
-    def _shape(self, prim: Any, owner: Any) -> Shape | None:
+    def _mesh(self, prim: Any, owner: Any) -> Shape:
+        """A mesh, a hull where its collider (of ``owner``) is one."""
         import trimesh
-        from pxr import UsdGeom, UsdPhysics
 
-        where, color = str(prim.GetPath()), self._color(prim)
-        matrix, place = self._matrix(prim)
-        if prim.IsA(UsdGeom.Mesh):
-            mesh = UsdGeom.Mesh(prim)
-            corners, counts = (np.array(a.Get() or (), dtype=np.int64) for a in (
-                mesh.GetFaceVertexIndicesAttr(), mesh.GetFaceVertexCountsAttr()
-            ))  # fmt: skip
-            points = np.array(mesh.GetPointsAttr().Get() or (), dtype=np.float64).reshape(-1, 3)
-            if counts.sum() != len(corners) or not len(points) or not 0 <= corners.min() <= corners.max() < len(points):
-                raise CorruptFileError(f"{self.path}: the faces of {where} do not fit to its points")
-            if mesh.GetHoleIndicesAttr().Get():
-                self.notes.append(f"{where}: its holes are filled")
-            rows = corners[cut_polygons(points, corners, counts)[0]]
-            check_triangles(self.path, len(rows))
-            inside_out = (mesh.GetOrientationAttr().Get() == "leftHanded") != (np.linalg.det(matrix) < 0)
-            surface = trimesh.Trimesh(points @ matrix.T + place, rows[:, :: -1 if inside_out else 1], process=False)
-            how = UsdPhysics.MeshCollisionAPI(owner or prim).GetApproximationAttr().Get() if owner else None
-            is_hull = how in ("convexHull", "boundingCube", "boundingSphere")
-            if how in ("boundingCube", "boundingSphere"):
-                self.notes.append(f"{where}: its {how} is taken as its hull")
-            return Shape("mesh", (1.0,) * 3, np.eye(4), where, self.path, color, is_hull, surface=surface)
+        where, colors, (matrix, place) = str(prim.GetPath()), self._colors(prim), self._matrix(prim)
+        names = ("points", "faceVertexIndices", "faceVertexCounts")
+        found, corners, counts = (np.array(prim.GetAttribute(name).Get() or ()) for name in names)
+        corners, counts, points = corners.astype(int), counts.astype(int), found.reshape(-1, 3).astype(float)
+        if counts.sum() != len(corners) or not len(corners) or not 0 <= corners.min() <= corners.max() < len(points):
+            raise CorruptFileError(f"{self.path}: the faces of {where} do not fit to its points")
+        if prim.GetAttribute("holeIndices").Get():
+            self.notes.append(f"{where}: its holes are filled")
+        cut, polygons = cut_polygons(points, corners, counts)
+        check_triangles(self.path, len(cut))
+        inside_out = (prim.GetAttribute("orientation").Get() == "leftHanded") != (np.linalg.det(matrix) < 0)
+        faces = corners[cut][:, :: -1 if inside_out else 1]
+        surface: Any = trimesh.Trimesh(points @ matrix.T + place, faces, process=False)
+        if len(colors) == len(counts):
+            surface.visual.face_colors = colors[polygons]
+        elif len(colors) == len(points):
+            surface.visual.vertex_colors = colors
+        elif len(colors) > 1:
+            self.notes.append(f"{where}: its {len(colors)} colours are not read")
+        how = owner.GetAttribute("physics:approximation").Get() if owner else None
+        if how in ("boundingCube", "boundingSphere"):
+            self.notes.append(f"{where}: its {how} is taken as its hull")
+        is_hull = how in ("convexHull", "boundingCube", "boundingSphere")
+        color = _one(colors)
+        return Shape("mesh", (1.0, 1.0, 1.0), np.eye(4), where, self.path, color, is_hull, surface=surface)
+
+    def _primitive(self, prim: Any) -> Shape | None:
+        from pxr import UsdGeom
+
+        where, color, (matrix, place) = str(prim.GetPath()), _one(self._colors(prim)), self._matrix(prim)
         scales = np.linalg.norm(matrix, axis=0)
         turn = matrix / scales
         if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-6:
             raise InvalidInputError(f"{self.path}: {where} is sheared; make it a mesh")
         turn = turn * np.sign(np.linalg.det(turn))  # primitives look the same in a mirror
-        get = partial(_number, prim)
         if prim.IsA(UsdGeom.Cube):
-            return Shape("box", tuple(get("size") * scales), pose_of(place, turn), where, None, color)
+            return Shape("box", tuple(_number(prim, "size") * scales), pose_of(place, turn), where, None, color)
         if prim.IsA(UsdGeom.Sphere):
-            return Shape("ellipsoid", tuple(get("radius") * scales), pose_of(place, turn), where, None, color)
-        kind = "cylinder" if prim.IsA(UsdGeom.Cylinder) else "capsule" if prim.IsA(UsdGeom.Capsule) else ""
-        if not kind:
+            size = tuple(_number(prim, "radius") * scales)
+            return Shape("ellipsoid", size, pose_of(place, turn), where, None, color)
+        if not (prim.IsA(UsdGeom.Cylinder) or prim.IsA(UsdGeom.Capsule)):
             return None
         order = np.roll(np.arange(3), -"XYZ".index(prim.GetAttribute("axis").Get()) - 1)  # the axis last
         scales, turn = scales[order], turn[:, order]
-        even = scales[:2] if kind == "cylinder" else scales
-        if np.ptp(even) > 1e-6 * scales.max():
+        if np.ptp(scales[: 2 if prim.IsA(UsdGeom.Cylinder) else 3]) > 1e-6 * scales.max():
             raise InvalidInputError(f"{self.path}: {where} is scaled unevenly; make it a mesh")
-        size = (float(get("radius") * scales[0]), float(get("height") * scales[2]))
-        return Shape(kind, size, pose_of(place, turn), where, None, color)  # type: ignore[arg-type]
+        size = (float(_number(prim, "radius") * scales[0]), float(_number(prim, "height") * scales[2]))
+        kind: Kind = "cylinder" if prim.IsA(UsdGeom.Cylinder) else "capsule"
+        return Shape(kind, size, pose_of(place, turn), where, None, color)
 
-    def _color(self, prim: Any) -> Color | None:
-        """The constant colour of a prim, from the linear one of the file."""
+    def _colors(self, prim: Any) -> Any:
+        """(N, 3) in 0..255 from the linear colours of a prim, N 0 without any."""
         from pxr import UsdGeom, UsdShade
 
-        values = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
+        values = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get() or ()
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
         for shader in material.GetPrim().GetChildren() if material else ():
             diffuse = shader.GetAttribute("inputs:diffuseColor")
@@ -286,62 +286,46 @@ class _Stage:
                 self.notes.append(f"not read: the textures of {material.GetPath()}")
         if material and material.GetPrim().GetAttribute("physics:dynamicFriction").HasAuthoredValue():
             self.notes.append("not read: friction of materials, because all objects of a scene have the same")
-        if not values:
-            return None
-        linear = np.clip(np.mean(values, axis=0), 0.0, 1.0)
-        if len(np.unique(np.array(values), axis=0)) > 1:
-            self.notes.append(f"{prim.GetPath()}: its {len(values)} colours are drawn as their mean")
+        linear = np.clip(np.array(values, dtype=float).reshape(-1, 3), 0.0, 1.0)
         shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-        red, green, blue = np.rint(255.0 * shown).astype(int).tolist()
-        return (red, green, blue)
+        return np.rint(255.0 * shown).astype(np.uint8)
 
     def weigh(self, body: Any) -> None:
         """Mass properties of a body by the rules of UsdPhysics: its own, else those of its colliders."""
-
         matrix, place = self._matrix(body)
-        mass, center, moments, axes = (body.GetAttribute(f"physics:{key}").Get() for key in _MASS)
-        turn = matrix / np.linalg.norm(matrix, axis=0)
-        filled: MassProperties | None = None
-        own = [(p, s) for p, s in self.collisions if body in _and_above(p)]
-        has_center = center is not None and np.isfinite(center).all()
-        if own and not (mass and has_center and moments and any(moments)):
+        names = ("mass", "centerOfMass", "diagonalInertia", "principalAxes")
+        mass, center, moments, axes = (body.GetAttribute(f"physics:{name}").Get() for name in names)
+        has_center, has_moments = center is not None and np.isfinite(center).all(), moments is not None and any(moments)
+        own = [(prim, shape) for prim, shape in self.collisions if body in _and_above(prim)]
+        found = MassProperties((mass or 0.0) * self.kilograms, place, np.zeros((3, 3)))
+        if own and not (mass and has_center and has_moments):
             solids = []
             for prim, shape in own:
-                solid = solid_of(shape)
+                solid, weight = solid_of(shape), _number(prim, "physics:mass") * self.kilograms
                 density = _number(prim, "physics:density") or _number(body, "physics:density")
-                weight = _number(prim, "physics:mass") * self.kilograms
-                per_volume = (density or 0.0) * self.kilograms / self.unit**3 or 1000.0
-                solids.append(heavier(solid, weight / solid.mass if weight else per_volume))
+                density *= self.kilograms / self.unit**3
+                solids.append(heavier(solid, weight / solid.mass if weight else density or 1000.0))
             filled = merged_inertial(solids)
-        kilograms = (mass or 0.0) * self.kilograms or (filled.mass if filled else 0.0)
-        if not kilograms:
-            self.notes.append(f"{body.GetPath()} has neither mass nor colliders")
-            return
-        if filled is not None:
-            filled = heavier(filled, kilograms / filled.mass)
-        middle = matrix @ np.array(center) + place if has_center else filled.center_of_mass if filled else place
-        if moments and any(moments):
+            found = heavier(filled, (found.mass or filled.mass) / filled.mass)
+        if has_center:
+            found = found._replace(center_of_mass=matrix @ np.array(center) + place)
+        if has_moments:
             quaternion = [*axes.GetImaginary(), axes.GetReal()] if axes and axes.GetLength() else [0.0, 0.0, 0.0, 1.0]
-            frame = turn @ Rotation.from_quat(quaternion).as_matrix()
-            inertia = (frame * np.array(moments) * self.kilograms * self.unit**2) @ frame.T
-        else:
-            inertia = filled.inertia if filled else np.zeros((3, 3))
-        self.inertials.append(MassProperties(float(kilograms), middle, inertia))
+            turn = matrix / np.linalg.norm(matrix, axis=0) @ Rotation.from_quat(quaternion).as_matrix()
+            found = found._replace(inertia=(turn * np.array(moments) * self.kilograms * self.unit**2) @ turn.T)
+        self.inertials.append(found)
 
 
-_MASS = ("mass", "centerOfMass", "diagonalInertia", "principalAxes")
+def _one(colors: Any) -> Color | None:
+    """The colour of one surface, if it has one."""
+    return (int(colors[0, 0]), int(colors[0, 1]), int(colors[0, 2])) if len(colors) == 1 else None
 
 
 def _number(prim: Any, name: str) -> float:
     """A number of a prim; 0 where it has none."""
-    value = prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None
-    return float(value or 0.0)
+    return float((prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None) or 0.0)
 
 
 def _and_above(prim: Any) -> list[Any]:
     """The prim and those above it."""
-    found = []
-    while prim and not prim.IsPseudoRoot():
-        found.append(prim)
-        prim = prim.GetParent()
-    return found
+    return [] if prim.IsPseudoRoot() else [prim, *_and_above(prim.GetParent())]

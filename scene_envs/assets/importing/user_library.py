@@ -33,7 +33,7 @@ from scene_envs.assets.importing.limits import (
     too_slow,
 )
 from scene_envs.assets.importing.mesh_files import Color, find_mesh, read_xml
-from scene_envs.assets.importing.simulator_files import used_layers
+from scene_envs.assets.importing.simulator_files import open_stage
 from scene_envs.assets.importing.solids import audit_parts
 from scene_envs.assets.recipes import RECIPES
 from scene_envs.errors import InvalidInputError, SceneEnvsError
@@ -150,9 +150,10 @@ def _unlisted(folder: Path, stamp: tuple[int, int]) -> FolderIndex:
 
 def _named_files(path: Path) -> set[Path]:
     """The files that a URDF, SDF, MJCF or USD uses; empty when it cannot be read."""
-    if path.suffix.lower().startswith(".usd"):
-        return used_layers(path)
     try:
+        if path.suffix.lower().startswith(".usd"):
+            stage = open_stage(path)
+            return {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers()} - {path.resolve()}
         root = read_xml(path)
     except SceneEnvsError:
         return set()
