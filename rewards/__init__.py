@@ -13,6 +13,7 @@ from rewards.base import (
     counts_objects,
     depends_on_batch,
     learned_parts,
+    needs_prompts,
 )
 from rewards.check import check_reward
 from rewards.clearance import Clearance
@@ -73,6 +74,7 @@ __all__ = [
     "learned_parts",
     "list_rewards",
     "make_reward",
+    "needs_prompts",
     "register_reward",
     "resolve_reward",
     "reward_info",

@@ -66,7 +66,8 @@ class Reward(Protocol):
     ``depends_on_batch`` that is True (see :func:`depends_on_batch`). A reward may declare its largest value by an
     attribute ``maximum`` (see :func:`declared_maximum`), which searches take for their scale. A reward that is a mean
     over the objects and gives credit per object says so by ``averages_objects = True`` (see :func:`averages_objects`).
-    A reward that counts objects says so by ``counts_objects = True`` (see :func:`counts_objects`).
+    A reward that counts objects says so by ``counts_objects = True`` (see :func:`counts_objects`). A reward that reads
+    the prompts of its context says so by ``needs_prompts = True``: runs without prompts then refuse it at their start.
     """
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput: ...
@@ -104,9 +105,18 @@ def counts_objects(*rewards: object) -> bool:
     return any(bool(getattr(reward, "counts_objects", False)) for reward in rewards)
 
 
+def needs_prompts(*rewards: object) -> bool:
+    """Whether one of ``rewards`` compares scenes with the prompts for which they were made.
+
+    >>> needs_prompts(lambda batch: batch.counts)
+    False
+    """
+    return any(bool(getattr(reward, "needs_prompts", False)) for reward in rewards)
+
+
 def facts_of(reward: object) -> dict[str, bool]:
-    """Whether ``reward`` depends on its batch, averages objects and counts objects, by the name of the attribute."""
-    return {fact.__name__: fact(reward) for fact in (depends_on_batch, averages_objects, counts_objects)}
+    """The answers of ``depends_on_batch``, ``averages_objects``, ``counts_objects`` and ``needs_prompts``, by name."""
+    return {fact.__name__: fact(reward) for fact in (depends_on_batch, averages_objects, counts_objects, needs_prompts)}
 
 
 def declared_maximum(reward: object, slots: int, free_slots: int) -> float | None:

@@ -23,6 +23,7 @@ from rewards.base import (
     declared_maximum,
     depends_on_batch,
     facts_of,
+    needs_prompts,
 )
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
@@ -59,6 +60,7 @@ class WeightedSum:
         self.depends_on_batch = depends_on_batch(*self.rewards)
         self.averages_objects = averages_objects(*self.rewards)
         self.counts_objects = counts_objects(*self.rewards)
+        self.needs_prompts = needs_prompts(*self.rewards)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         outputs = _score_parts(self.rewards, batch, context)
@@ -135,6 +137,7 @@ class Gate:
         parts = {"reward": resolve_reward(self.reward), "condition": resolve_reward(self.condition)}
         vars(self).update(parts, **facts_of(parts["reward"]))
         vars(self)["depends_on_batch"] = depends_on_batch(*parts.values())
+        vars(self)["needs_prompts"] = needs_prompts(*parts.values())
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score both; credit per object is that of ``reward`` where the gate is open, else 0."""

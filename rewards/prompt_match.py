@@ -12,6 +12,7 @@ import torch
 
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
+from scene_envs.envs.scoring import no_prompts
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
@@ -43,6 +44,11 @@ class PromptMatch:
     name: ClassVar[str] = "prompt_match"
     maximum: ClassVar[float] = 1.0
     prompt: str | None = None
+
+    @property
+    def needs_prompts(self) -> bool:
+        """Whether the prompts come with the scenes."""
+        return self.prompt is None
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Compare every scene with its prompt.
@@ -79,10 +85,7 @@ class PromptMatch:
         if self.prompt is not None:
             return [parse_prompt(self.prompt, batch.scene_type)] * len(batch)
         if prompts is None:
-            raise InvalidInputError(
-                "prompt_match has no prompt to compare with: give prompt= to the command or environment, or "
-                "reward='{name: prompt_match, prompt: A scene with 12 objects}'"
-            )
+            raise InvalidInputError(no_prompts(self.name))
         if len(prompts) != len(batch):
             raise InvalidInputError(f"prompt_match: {len(prompts)} prompts for {len(batch)} scenes; give one per scene")
         return [_claims(text, batch.scene_type) for text in prompts]

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 import re
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
@@ -20,7 +17,7 @@ from torch import Tensor
 
 from rewards.base import Reward, RewardContext, RewardOutput, facts_of
 from scene_envs.errors import InvalidInputError, RewardError
-from scene_envs.registry import PluginError, Registry, load_plugin
+from scene_envs.registry import PluginError, Registry, load_plugin, run_file
 from scene_envs.scene import SceneBatch
 
 ENTRY_POINT_GROUP = "scene_envs.rewards"
@@ -135,24 +132,10 @@ def load_local(reward: str) -> Callable[..., Any]:
         )
     if not path.is_file():
         raise InvalidInputError(f"reward {reward!r}: there is no file {str(path)!r}")
-    key = f"local_rewards_{hashlib.blake2b(str(path).encode(), digest_size=8).hexdigest()}"
-    if key not in sys.modules:
-        spec = spec_from_file_location(key, path)
-        assert spec is not None
-        assert spec.loader is not None
-        module = module_from_spec(spec)
-        sys.modules[key] = module
-        try:
-            spec.loader.exec_module(module)
-        except KeyboardInterrupt:
-            del sys.modules[key]
-            raise
-        except BaseException as error:
-            del sys.modules[key]
-            raise RewardError(
-                f"reward {reward!r}: the file cannot be run: {type(error).__name__}: {str(error)[:300]}"
-            ) from error
-    found = getattr(sys.modules[key], match["name"], None)
+    try:
+        found = getattr(run_file(path), match["name"], None)
+    except PluginError as error:
+        raise RewardError(f"reward {reward!r}: {error}") from error
     if not callable(found):
         raise InvalidInputError(f"reward {reward!r}: {str(path)!r} has no function or class {match['name']!r}")
     return found  # type: ignore[no-any-return]

@@ -115,7 +115,7 @@ class Normalizer:
                 f"normalizer_state lacks {error}; it needs params.scale, .min, .input_stats"
             ) from error
         try:
-            scale, offset, low, high = (torch.tensor(vector, dtype=torch.float32) for vector in vectors)
+            scale, offset, low, high = (torch.as_tensor(vector, dtype=torch.float32) for vector in vectors)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise InvalidInputError(f"normalizer_state holds values that are no numbers: {str(error)[:200]}") from error
         numbers = (scale, offset, low, high)

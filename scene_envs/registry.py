@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import hashlib
 import logging
 import os
 import signal
@@ -13,8 +14,9 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import Any, NoReturn, TypeVar
 
 import gymnasium
@@ -58,9 +60,12 @@ def _checkout_entry_points(pyproject: Path) -> dict[str, dict[str, str]]:
 
 @cache
 def load_plugins(group: str) -> None:
-    """Import every module of ``group``, which registers its components, once per process, when a name is not found. A
-    plug-in that fails to import is reported in the log and does not keep others from working.
+    """Import every module of ``group``, which registers its components, and run the files of ``SCENE_ENVS_FILES``, once
+    per process, when a name is not found. A plug-in that fails to import is reported in the log and does not keep
+    others from working; a file that cannot be run is a PluginError.
     """
+    for path in filter(None, os.environ.get(FILES, "").split(os.pathsep)):
+        run_file(Path(path))
     for point in plugin_entry_points(group).values():
         try:
             load_plugin(point)
@@ -90,6 +95,29 @@ def load_plugin(point: EntryPoint) -> Any:
 
 class PluginError(SceneEnvsError):
     """A plug-in cannot be imported."""
+
+
+FILES = "SCENE_ENVS_FILES"
+"""Environment variable with files of the user, which register components as the modules of installed packages do; the
+processes that a command starts inherit it."""
+
+
+def run_file(path: Path) -> ModuleType:
+    """The module of a Python file, which runs once per process; PluginError says why it cannot be run."""
+    name = f"scene_envs_file_{hashlib.blake2b(str(path).encode(), digest_size=8).hexdigest()}"
+    if name not in sys.modules:
+        spec = spec_from_file_location(name, path)
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[name] = module_from_spec(spec)
+        try:
+            spec.loader.exec_module(sys.modules[name])
+        except BaseException as error:
+            del sys.modules[name]
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            raise PluginError(f"{str(path)!r} cannot be run: {describe_error(error)[:300]}") from error
+    return sys.modules[name]
 
 
 _LATE = "the import of a plug-in takes too long"
@@ -217,8 +245,8 @@ class Registry(dict[str, Component]):
 
     def _load_plugins(self) -> None:
         """Import the modules of this project, then those of installed packages, which may replace its components."""
-        if self._read is None and self.points():
-            self._import(*self._modules.values())
+        if self._read is None:
+            self._import(*(self._modules.values() if self.points() else ()))
             load_plugins(self.group)
 
     def _import(self, *modules: str) -> None:

@@ -25,7 +25,7 @@ from typing import Any
 
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import compose, format_rows, help_text, keys_of
-from agents.cli.run_folder import Run, fresh_directory
+from agents.cli.run_folder import RESUMING, Run, fresh_directory
 from agents.configuration.composition import (
     PROGRESS_STYLES,
     config_text,
@@ -48,6 +48,7 @@ from scene_envs.errors import (
     unknown_name,
 )
 from scene_envs.files import find_scenes
+from scene_envs.registry import FILES, PluginError, run_file
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -63,7 +64,7 @@ usage: scene-envs COMMAND key=value ...
 scene-envs COMMAND --help lists the keys of a command; --traceback shows where an error came from.
 --cfg job prints the keys and runs nothing; --config FILE starts the run of a config.yaml again;
 --config-dir FOLDER adds groups and experiments (+experiment=NAME); --multirun seed=0,1,2 makes a run of each.
---allow-local allows reward=./my_rewards.py:clutter to run that file without a question.
+--allow-local allows reward=./mine.py:clutter, mask=./mine.py:top, … to run that file without a question.
 A command writes into output=FOLDER, by default runs/COMMAND-TIME.
 """
 _FLAGS = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -91,6 +92,9 @@ _DEVICE = (
 """Devices that torch knows, and their automatic choice."""
 _DATASETS = ("data", "heldout", "regularisation.scenes")
 _GRAMMAR = "grammar"
+_FROM_FILES = ("scene", "mask", "masks", "planner", "algorithm", "network")
+"""Keys whose components a file may register; rewards (``reward``, ``objective``) load their files themselves."""
+_FILE = re.compile(r"(?P<path>[^\s,\[\]{}'\"]+\.py):(?P<name>[A-Za-z_]\w*)")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -119,10 +123,10 @@ def _guarded(argv: Sequence[str] | None, work: Callable[[list[str]], int]) -> in
         with terminable(signals):
             _check_text(words)
             return work(words)
-    except Terminated:
-        return _ended(TERMINATED)
-    except KeyboardInterrupt:
-        return _ended(INTERRUPTED)
+    except Terminated as error:
+        return _ended(TERMINATED, str(error))
+    except KeyboardInterrupt as error:
+        return _ended(INTERRUPTED, str(error))
     except BrokenPipeError:  # the reader of our output has gone, as in `scene-envs rewards | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
@@ -142,9 +146,9 @@ def _check_text(words: Sequence[str]) -> None:
             raise InvalidInputError(f"{ascii(word)[:200]} is no text in UTF-8; give files and folders another name")
 
 
-def _ended(status: int) -> int:
+def _ended(status: int, what_now: str = "") -> int:
     what = "terminated" if status == TERMINATED else "interrupted"
-    return _complain(f"{what}; where the output can be resumed, the same command goes on", status)
+    return _complain(f"{what}; {what_now}" if what_now else what, status)
 
 
 def entry_point() -> None:
@@ -181,6 +185,7 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
         raise InvalidInputError(f"--cfg {shown}: only --cfg job is known, which prints the keys and runs nothing")
     command = program.removeprefix("scene-envs ")
     named = _named(words, getattr(module, "POSITIONAL", ()))
+    named = [_without_file(word, flags.allow_local) for word in named]
     keys = keys_of(module)
     if flags.help:
         config = keys if sweep or not named else compose(command, keys, named, config_dir, file)
@@ -202,19 +207,34 @@ def _run_or_help(program: str, meaning: str, module: ModuleType, words: list[str
     return DONE
 
 
-def _ask_for_files(key: str, reward: Any, allow_local: bool) -> None:
-    from rewards.registry import allow_local_rewards, allowed_files, local_files
+def _without_file(word: str, allow_local: bool) -> str:
+    """The word with ``NAME`` for each ``PATH.py:NAME``, whose file has run and registered the component ``NAME``."""
+    key, _, value = word.partition("=")
+    if key.partition(".")[0] not in _FROM_FILES or ".py:" not in value:
+        return word
 
-    for path in local_files(reward):
-        if path in allowed_files():
-            continue
-        allowed = allow_local
-        if not allowed and sys.stdin is not None and sys.stdin.isatty():
-            print(f"{key}= runs the file {path}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
-            allowed = sys.stdin.readline().strip().lower() in ("y", "yes")
-        if not allowed:
-            raise InvalidInputError(f"{key}= would run the file {str(path)!r}; add --allow-local if you trust it")
-        allow_local_rewards(path)
+    def run(found: re.Match[str]) -> str:
+        path = Path(found["path"]).expanduser().resolve()
+        if not path.is_file():
+            raise InvalidInputError(f"{key}={found[0]}: there is no file {str(path)!r}")
+        _ask_for_file(key, path, allow_local)
+        try:
+            run_file(path)
+        except PluginError as error:
+            raise InvalidInputError(f"{key}={found[0]}: {error}") from error
+        others = os.environ.get(FILES, "").split(os.pathsep)
+        os.environ[FILES] = os.pathsep.join(dict.fromkeys(filter(None, [*others, str(path)])))
+        return found["name"]
+
+    return f"{key}={_FILE.sub(run, value)}"
+
+
+def _ask_for_file(key: str, path: Path, allow_local: bool) -> None:
+    if not allow_local and sys.stdin is not None and sys.stdin.isatty():
+        print(f"{key}= runs the file {path}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
+        allow_local = sys.stdin.readline().strip().lower() in ("y", "yes")
+    if not allow_local:
+        raise InvalidInputError(f"{key}= would run the file {str(path)!r}; add --allow-local if you trust it")
 
 
 def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> None:
@@ -225,7 +245,13 @@ def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> No
     else:
         settings = settings if settings.output else replace(settings, output=fresh_directory(command))
         with Run(command, settings) as run:
-            module.run(settings, run)
+            try:
+                module.run(settings, run)
+            except KeyboardInterrupt as error:
+                same = f"the same command with output={settings.output}"
+                goes_on = f"{same} goes on where this one ended"
+                begins = f"{command} keeps no partial work, so {same} begins anew"
+                raise type(error)(goes_on if command in RESUMING else begins) from error
 
 
 def _named(words: Sequence[str], keys: Sequence[str]) -> list[str]:
@@ -342,7 +368,11 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
         engine_name(physics)
     for key in ("reward", "objective"):
         if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
-            _ask_for_files(key, getattr(settings, key), allow_local)
+            from rewards.registry import allow_local_rewards, allowed_files, local_files
+
+            for path in [path for path in local_files(getattr(settings, key)) if path not in allowed_files()]:
+                _ask_for_file(key, path, allow_local)
+                allow_local_rewards(path)
     if device not in ("auto", "cpu"):  # neither needs torch to be checked
         resolve_device(device)
 

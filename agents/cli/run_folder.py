@@ -45,9 +45,9 @@ _RESUMES = {
     "search": "best.safetensors",
 }
 """Commands that can continue a run that was started in Python, and the file that shows that there is one."""
-_OWN_RULE = ("generate", "pretrain", "post-train", "search", "demo", "evaluate")
-"""Commands that themselves compare their keys with those in the folder. Programs whose settings have ``compares_keys``
-do the same."""
+RESUMING = ("generate", "pretrain", "post-train", "search", "demo", "evaluate")
+"""Commands that go on where an earlier one ended, and themselves compare their keys with those in the folder. Programs
+whose settings have ``compares_keys`` do the same."""
 _MAY_DIFFER = (
     "output",
     "workers",
@@ -119,7 +119,7 @@ class Run:
         if writer != self.command:
             other = "another program" if writer is None else f"scene-envs {writer}"
             raise InvalidInputError(f"output={str(self.directory)!r} holds {found[0]} of {other}; give another output")
-        if self.command not in _OWN_RULE and not getattr(self.settings, "compares_keys", False):
+        if self.command not in RESUMING and not getattr(self.settings, "compares_keys", False):
             self._check_keys()
         return True
 

@@ -111,9 +111,9 @@ class Preconditioning:
         """Inverse of :meth:`state`; raises KeyError on a missing entry, ValueError where entries cannot be moments."""
         own = state.get("by_category")
         by_category = (
-            None if own is None else CategoryMoments(*(torch.tensor(own[k]) for k in ("share", "mean", "std")))
+            None if own is None else CategoryMoments(*(torch.as_tensor(own[k]) for k in ("share", "mean", "std")))
         )
-        mean, std = (torch.tensor(state[key], dtype=torch.float32) for key in ("mean", "std"))
+        mean, std = (torch.as_tensor(state[key], dtype=torch.float32) for key in ("mean", "std"))
         known = [mean, std, *([] if by_category is None else (by_category.share, by_category.mean, by_category.std))]
         if mean.shape != std.shape or mean.ndim != 1 or not all(bool(torch.isfinite(part).all()) for part in known):
             raise ValueError("the moments of the preconditioning must be finite numbers, one mean and std per feature")

@@ -47,7 +47,8 @@ _OF_ENV = (
 """Settings of a search that are arguments of its environment."""
 
 Progress = Callable[[str, int, int, float], None]
-"""Called after every round with the planner's name, the expansions so far, the budget and the best Φ so far."""
+"""Called after every round with the planner's name, the expansions so far, the budget and the best objective so far (at
+most ``objective_scale``)."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +160,9 @@ class _Run:
         config, starts, started = self.config, self.starts, time.perf_counter()
         planner, scenes = config.planner.make(config.branching), config.expansions
         actions = max(scenes, config.branching) if config.planner.widens else config.branching
+        end = math.inf if config.max_seconds is None else started + config.max_seconds
         for part in config.parts:
-            left = math.inf if config.max_seconds is None else config.max_seconds - (time.perf_counter() - started)
+            left = end - time.perf_counter()
             if left <= 0 and self.spent:
                 self.stopped = "time"
                 break
@@ -179,10 +181,11 @@ class _Run:
             if self.stopped:
                 break
         searched, best_of = time.perf_counter(), None
-        if config.baseline and self.spent and self.stopped in ("", "time"):
+        if config.baseline and self.spent and not self.stopped and searched < end:
             # Children are seeded by their path: the first scenes are those of the first search, unless that is steered.
             wide = self.spent if config.masks is None else max(actions, -(-self.spent // len(config.masks)))
-            _, _, (best_of,) = self.plan(BestOfPlanner(), wide, self.spent, range(1), "best of N")
+            _, ended, (best_of,) = self.plan(BestOfPlanner(), wide, self.spent, range(1), "best of N", end - searched)
+            best_of = None if ended.stopped else best_of  # of fewer scenes than the search, so no baseline of it
         seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}
         self._check_found(session.lanes[0].root, env.problem.scale)
         best = min(self.searches, key=loss_of)
@@ -291,8 +294,8 @@ class _Run:
         session = Session(env, max_seconds=max_seconds, journal=journal)
         title, total = name.split("_")[0], budget * (config.count or 1 if name.startswith("search") else 1)
         before = part.start * budget
-        report_to = self.progress
-        report = None if report_to is None else lambda done, best: report_to(title, before + done, total, best)
+        report_to, scale = self.progress, env.problem.scale
+        report = None if report_to is None else lambda done, best: report_to(title, before + done, total, best * scale)
         try:
             empty = SceneBatch.empty(self.prior.scene_type, 1, env.problem.slots)
             roots = []

@@ -44,7 +44,7 @@ class SearchConfig(BudgetKeys, SamplingKeys, PrecisionKeys, DeviceKeys):
             num_steps``, or twice that with guidance.
         max_nfe: largest number of denoiser evaluations of each search; null for no limit other than the budget.
         max_seconds: seconds after which the search ends and returns the best scene found; null for no limit. The
-            baseline runs afterwards.
+            baseline, which comes after the search, is left out where it would take longer.
         count: number of searches, each with its own seed; each gives one scene. null for one search, or for one from
             each of ``scenes``.
         side_by_side: number of searches that run at once, in common batches of the denoiser; the others follow.

@@ -28,12 +28,11 @@ from agents.utils.process_group import ProcessGroup, gather_rows
 from rewards import (
     RewardContext,
     RewardOutput,
-    averages_objects,
-    counts_objects,
     depends_on_batch,
     learned_parts,
     reward_name,
 )
+from rewards.base import facts_of
 from rewards.evaluation import evaluate_reward
 from rewards.process import close_reward
 from scene_envs.arrays import Result, within_memory
@@ -248,12 +247,10 @@ class WholeBatchReward:
     equally many scenes, scores the scenes of all.
     """
 
-    depends_on_batch = True
-
     def __init__(self, reward: Any, processes: ProcessGroup) -> None:
         self._reward, self._processes = reward, processes
         self.name = reward_name(reward)
-        self.averages_objects, self.counts_objects = averages_objects(reward), counts_objects(reward)
+        vars(self).update(facts_of(reward), depends_on_batch=True)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Scores of ``batch``."""

@@ -122,9 +122,9 @@ def post_train_and_compare(
                 claim_guidance=config.claim_guidance, slots=slots, reward=reward,
             )  # fmt: skip
 
-        say(f"measuring {scenes} samples of the base prior")
-        before = measure(base)
-        say(f"measuring {scenes} samples of the post-trained prior")
+        say(f"measuring {scenes} samples of the base prior, then of the post-trained one")
+        before, half = measure(base), time.perf_counter() - trained
+        say(f"measuring {scenes} samples of the post-trained prior, about {half:.0f} s")
         after = measure(result.prior)
     seconds = {"training": round(trained - started, 1), "measuring": round(time.perf_counter() - trained, 1)}
     say("drawing the report")

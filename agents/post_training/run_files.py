@@ -154,7 +154,7 @@ def run_progress(title: str, total: int, style: str, done: int = 0) -> Iterator[
 
         def update(iteration: int, reward: float, guard: float) -> None:
             left = progress.seconds / max(1, iteration - done) * (total - iteration)
-            line = f"{title} {iteration}/{total}  reward {reward:.3g}  guard {guard:.2f}x  {left:.0f} s left"
+            line = f"{title} {iteration}/{total}  reward {reward:.3g}  guard {guard:.2f}x  {left:.0f} s of training left"
             progress.update(iteration, f"reward [green]{reward:.3g}[/]  guard [yellow]{guard:.2f}x[/]", line)
 
         yield update

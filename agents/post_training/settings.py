@@ -506,7 +506,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         logger: log files and report.
     """
 
-    prior: str = "dimsum_table_continuous"
+    prior: str = "dimsum_table"
     reward: Any = named("object_count", "reward")
     prompt: str | list[str] | None = None  # type: ignore[assignment]
     num_steps: int = 25

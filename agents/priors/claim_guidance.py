@@ -5,6 +5,7 @@ Claims become linear constraints on pairs of objects: what stands on, in, next t
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
@@ -24,6 +25,8 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
 from scene_envs.supports import CONTACT, LARGEST_CONTACT
+
+logger = logging.getLogger(__name__)
 
 _FINEST = 0.02
 """Error (m) of positions below which nothing is moved: the denoising that is left separates objects again."""
@@ -182,10 +185,11 @@ _STOREY = 0.2
 
 @lru_cache(maxsize=4096)
 def claims_of(prompt: str, scene_type: str | SceneType) -> tuple[Claim, ...]:
-    """The claims of a prompt; none where it cannot be read."""
+    """The claims of a prompt; none, with one warning, where it cannot be read."""
     try:
         return parse_prompt(prompt, scene_type).claims if prompt.strip() else ()
-    except InvalidInputError:
+    except InvalidInputError as error:
+        logger.warning("%s. claim_guidance does nothing for this prompt.", error)
         return ()
 
 

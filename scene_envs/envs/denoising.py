@@ -105,7 +105,7 @@ class DenoisingCore:
         self.num_steps = len(self.table)
         self.device = prior_device(self.prior)
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
-        self.scorer = RewardScorer(chosen.reward, chosen.workers, chosen.physics)
+        self.scorer = RewardScorer(chosen.reward, chosen.workers, chosen.physics, prompted=self.prompting.given)
         self.term_names = self.scorer.probe(
             SceneBatch.empty(self.scene_type, 1, self.slots), [""] if self.prompting.given else None
         )

@@ -94,27 +94,41 @@ class Score:
         )
 
 
+def no_prompts(reward: str) -> str:
+    """The message for a ``reward`` that needs prompts, where there are none."""
+    return (
+        f"{reward} has no prompt to compare with: give prompt= to the command or environment, or "
+        "reward='{name: prompt_match, prompt: A scene with 12 objects}'"
+    )
+
+
 class RewardScorer:
     """Scorer of batches of scenes, on their device; its reward, a name, mapping, function or object, is resolved once.
     The ``workers`` for physics start at the first scoring; 0 computes in this process, ``"ray"`` on a Ray cluster.
-    ``physics`` names the engine. ``depends_on_batch``, ``averages_objects`` and ``counts_objects`` are the reward's.
+    ``physics`` names the engine, and ``prompted`` says whether the scenes have prompts. ``depends_on_batch``,
+    ``averages_objects`` and ``counts_objects`` are the reward's. An InvalidInputError if the reward needs prompts that
+    there are not.
 
     >>> scorer = RewardScorer("object_count")
     >>> scorer(SceneBatch.empty("dimsum_table", 2)).valid.tolist()
     [True, True]
     """
 
-    def __init__(self, reward: Any, workers: int | str = 0, physics: str = "auto") -> None:
+    def __init__(self, reward: Any, workers: int | str = 0, physics: str = "auto", *, prompted: bool = True) -> None:
         number = isinstance(workers, int) and workers >= 0
         if not number and workers != "ray":
             raise InvalidInputError(
                 f"workers={workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
             )
         self._score = resolve_reward(reward)
-        facts = "depends_on_batch", "averages_objects", "counts_objects"
-        self.depends_on_batch, self.averages_objects, self.counts_objects = (
+        facts = "depends_on_batch", "averages_objects", "counts_objects", "needs_prompts"
+        self.depends_on_batch, self.averages_objects, self.counts_objects, needs_prompts = (
             bool(getattr(self._score, fact, False)) for fact in facts
         )
+        if needs_prompts and not prompted:
+            raise InvalidInputError(
+                no_prompts(reward if isinstance(reward, str) else getattr(reward, "name", "the reward"))
+            )
         self.workers, self.physics = workers, physics
         self._pool: Any = None
 

@@ -142,7 +142,7 @@ class SearchProblem:
         self.prior.step_table(self.num_steps)  # raises if the prior has fewer steps
         self.prompting = EnvPrompts(self.prior, chosen.prompt, chosen.guidance, self.slots)
         self.prompt = self.prompting.draw(np.random.default_rng(0)) if self.prompting.given else None
-        self.scorer = RewardScorer(chosen.objective, chosen.workers, chosen.physics)
+        self.scorer = RewardScorer(chosen.objective, chosen.workers, chosen.physics, prompted=self.prompting.given)
         if self.scorer.depends_on_batch:
             raise InvalidInputError(
                 f"objective={chosen.objective!r} scores a scene by the other scenes of its batch, and a search "

@@ -346,5 +346,52 @@ def test_search_and_baseline_have_a_last_line_with_the_scenes_and_evaluations(
     assert main(["search", f"prior={prior}", *words, f"output={tmp_path / 'found'}"]) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if " scenes, best " in line]
     assert [line.split(":")[0] for line in lines] == ["search", "best of N"]
-    assert all("6/6 scenes, best 0." in line or "6/6 scenes, best 1." in line for line in lines)
     assert all(line.endswith("12 NFE") for line in lines)
+    found = metrics(tmp_path / "found")  # progress and result have one unit: the objective
+    told = [float(line.split("best ")[-1].split(",")[0]) for line in lines]
+    assert told == [found["search"]["objective"], found["best_of"]["objective"]]
+    assert max(told) > 1
+
+
+@pytest.mark.slow
+def test_a_baseline_that_would_take_longer_than_the_limit_is_left_out_and_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    prior = tiny_prior("dimsum_table", process="mixed", slots=6).save(tmp_path / "prior")
+    words = ["objective=object_count", "planner=greedy", "budget=6", "branching=2", "num_steps=2", "max_seconds=1e-6"]
+    assert main(["search", f"prior={prior}", *words, f"output={tmp_path / 'found'}"]) == 0
+    assert "the baseline, as many independent samples, is left out" in capsys.readouterr().out
+    assert "best_of" not in metrics(tmp_path / "found")
+
+
+@pytest.mark.parametrize("command", ["sample reward", "search objective", "post-train reward", "doctor reward"])
+def test_a_reward_that_needs_prompts_is_refused_before_anything_is_sampled(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    prior = tiny_prior("dimsum_table", process="mixed", text=True).save(tmp_path / "prior")
+    name, key = command.split()
+    nested = "{name: weighted_sum, rewards: [object_count, prompt_match]}"
+    assert main([name, f"prior={prior}", f"{key}={nested}", f"output={tmp_path / 'run'}"]) == 2
+    said = capsys.readouterr()
+    assert "has no prompt to compare with: give prompt=" in said.err
+    assert "scenes in" not in said.out
+    assert not (tmp_path / "run" / "metrics.json").exists()
+
+
+def test_a_sample_says_how_many_claims_of_its_prompt_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    prior = tiny_prior("dimsum_table", process="mixed", text=True).save(tmp_path / "prior")
+    words = [f"prior={prior}", "count=2", "num_steps=2", "pictures=0", "reward=prompt_match"]
+    run = tmp_path / "counted"
+    assert main(["sample", *words, "prompt=A scene with 12 objects.", f"output={run}"]) == 0
+    found, counts = metrics(run), SceneBatch.load(run / "scenes.safetensors").counts
+    held = float((counts == 12).double().mean())
+    assert found["prompt"] == {"claims_hold": held, "all_claims_hold": held}
+    ratio = (torch.minimum(counts, torch.tensor(12)) / torch.maximum(counts, torch.tensor(12))).double().mean()
+    assert found["reward"]["mean"] == pytest.approx(
+        float(ratio), abs=1e-6
+    )  # the reward reads the prompt of the samples
+    assert f"prompt: {held:.0%} of the claims hold" in capsys.readouterr().out
+    assert main(["sample", *words[:-1], "prompt=a table", "claim_guidance=2", f"output={tmp_path / 'free'}"]) == 0
+    said = capsys.readouterr()
+    assert "expected 'A scene with …' or 'A scene where …'. claim_guidance does nothing for this prompt" in said.err
+    assert "prompt" not in metrics(tmp_path / "free")

@@ -9,22 +9,27 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from agents.cli import main
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import describe_fields, keys_of
 from agents.configuration.composition import MEASURE_NAMES, known_masks, known_rewards
+from agents.planning.ledger import _PLANNERS
 from agents.pretraining.settings import NETWORKS, registered_networks
 from agents.priors import list_priors
 from rewards import list_rewards
 from rewards import registry as local_files
 from rewards.registry import registered_module
-from scene_envs import list_masks
+from scene_envs import get_scene_type, list_masks
+from scene_envs.envs.masks import _MASKS
 from scene_envs.errors import PhysicsError
 from scene_envs.grammars import list_grammars
+from scene_envs.scene_types import _SCENE_TYPES
 
 MAIN = import_module("agents.cli.main")
 """The module; ``agents.cli.main`` is its function."""
@@ -451,3 +456,54 @@ def test_a_yes_to_one_file_is_no_yes_to_another(reward_files, monkeypatch, capsy
     err = capsys.readouterr().err
     assert err.count("Run it?") == 2
     assert "two.py'; add --allow-local" in err
+
+
+COMPONENTS = """
+from dataclasses import dataclass, replace
+
+from agents.planning import GreedyPlanner, register_planner
+from scene_envs import get_scene_type, register_mask, register_scene_type
+
+
+@register_mask("upper_of_file")
+def upper(scene, score, rng):
+    return scene.is_free[0] & (scene.translations[0, :, 2] > 0.1)
+
+
+@register_planner("greedy_of_file")
+@dataclass(frozen=True)
+class Greedy(GreedyPlanner):
+    name: str = "greedy_of_file"
+
+
+register_scene_type(replace(get_scene_type("pantry_shelf"), name="pantry_of_file"))
+"""
+
+
+def test_masks_planners_and_scene_types_come_from_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SCENE_ENVS_FILES", "")
+    file = tmp_path / "mine.py"
+    file.write_text(COMPONENTS)
+    words = ["search", f"masks=[{file}:upper_of_file, empty]", f"planner={file}:greedy_of_file"]
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    assert main(words) == 2
+    assert "mine.py'; add --allow-local if you trust it" in capsys.readouterr().err
+    assert main([*words, "--allow-local", "--cfg", "job"]) == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    assert shown["masks"] == ["upper_of_file", "empty"]
+    assert shown["planner"]["name"] == "greedy_of_file"
+    assert main(["generate", f"scene={file}:pantry_of_file", "--allow-local", "--cfg", "job"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["scene"] == "pantry_of_file"
+    assert main(["search", f"mask={file}:lower", "--allow-local"]) == 2
+    assert "unknown mask 'lower'" in capsys.readouterr().err
+    assert main(["search", f"mask={tmp_path}/other.py:lower", "--allow-local"]) == 2
+    assert "there is no file" in capsys.readouterr().err
+    code = (
+        "from scene_envs import get_scene_type; print(get_scene_type('pantry_of_file').slots)"  # processes inherit it
+    )
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(child.stdout) == get_scene_type("pantry_shelf").slots
+    for registry, name in ((_MASKS, "upper"), (_PLANNERS, "greedy"), (_SCENE_TYPES, "pantry")):
+        registry.pop(f"{name}_of_file")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -145,12 +147,13 @@ def forward(state: State, pose: Tensor, category: Tensor, t: Tensor, text: Tenso
     return noise, logits
 
 
-def _normalizer(features: int) -> dict[str, object]:
+def _normalizer(features: int, kind: Callable[[list[float]], Any] = list) -> dict[str, object]:
+    """The normaliser; a checkpoint has tensors in it, and the metadata lists."""
     return {
         "params": {
-            "scale": [2.0] * features,
-            "min": [0.0] * features,
-            "input_stats": {"min": [-0.5] * features, "max": [0.5] * features},
+            "scale": kind([2.0] * features),
+            "min": kind([0.0] * features),
+            "input_stats": {"min": kind([-0.5] * features), "max": kind([0.5] * features)},
         },
         "is_fitted": True,
     }
@@ -172,7 +175,7 @@ def write_checkpoint(
         "state_dict": {f"model.{name}": 0.0 * tensor for name, tensor in state.items()}
         | {f"ema.averaged_model.{name}": tensor for name, tensor in state.items()}
         | {"ema.optimization_step": torch.tensor(7), "txt_encoder.weight": torch.zeros(2)},
-        "normalizer_state": _normalizer(12),
+        "normalizer_state": _normalizer(12, torch.tensor),
         "global_step": 1234,
         "optimizer_states": [{"state": {}}],
         **extra,

@@ -294,7 +294,7 @@ def test_an_interrupted_command_says_so_and_can_go_on(
     assert main(words) == status
     shown = capsys.readouterr()
     assert "by greedy with 12 denoiser evaluations" in shown.out
-    assert "the same command goes on" in shown.err
+    assert f"the same command with output={output} goes on where this one ended" in shown.err
     register_reward("interrupting")(Counting())
     assert main([*words, "max_seconds=1000", "count=1"]) == 0
     assert json.loads((output / "metrics.json").read_text())["nfe"] == 18

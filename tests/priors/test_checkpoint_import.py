@@ -32,6 +32,7 @@ def test_the_network_computes_exactly_the_described_function(tmp_path: Path, tex
     torch.testing.assert_close(logits, expected_logits, atol=1e-9, rtol=1e-9)
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.slow
 def test_the_result_samples_and_survives_a_round_trip(tmp_path: Path) -> None:
     prior = import_checkpoint(*write_checkpoint(tmp_path, random_state()), scene="dimsum_table")

@@ -13,6 +13,7 @@ from agents.configuration.composition import DrawKeys, OutputKeys, RewardLimitKe
 from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from scene_envs.scene import SceneBatch
     from scene_envs.scene_types import SceneType
 
 
@@ -55,7 +56,9 @@ def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.evaluation.physics_figures import leaving_out
     from agents.priors.guidance import physics_strength
+    from rewards import needs_prompts, reward_name
     from rewards.process import close_reward, run_reward
+    from scene_envs.envs.scoring import no_prompts
     from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import make_pool
     from scene_envs.scene import SceneBatch
@@ -70,6 +73,8 @@ def run(settings: SampleConfig, run: Run) -> None:
             workers=settings.workers,
             physics=settings.physics,
         )
+        if needs_prompts(reward) and settings.prompt is None:
+            raise InvalidInputError(no_prompts(reward_name(reward)))
     prior = load_prior(settings).with_union(settings.union)
     if not prior.scene_type.has_geometry:
         settings = _without_geometry(settings, prior.scene_type, run)
@@ -99,11 +104,13 @@ def run(settings: SampleConfig, run: Run) -> None:
         "sampling_seconds": round(seconds, 3),
         "physics_guidance": strength,
     }
+    if settings.prompt:
+        metrics |= _claims_followed(batch, settings, run)
     with make_pool(settings.workers, physics=settings.physics) as pool:
         if reward is not None:
             left_out: dict[str, str] = {}
             with leaving_out("reward", left_out):
-                metrics["reward"] = reward_figures(reward, batch, pool, run)
+                metrics["reward"] = reward_figures(reward, batch, settings.prompt, pool, run)
             if left_out:
                 metrics["left_out"] = left_out
             close_reward(reward)
@@ -115,6 +122,24 @@ def run(settings: SampleConfig, run: Run) -> None:
             metrics["export"] = export_scenes(batch, formats, run.directory / "export", pool, run)
     run.write_metrics(metrics)
     run.say(f"written to {run.directory}")
+
+
+def _claims_followed(batch: SceneBatch, settings: SampleConfig, run: Run) -> dict[str, Any]:
+    """Shares of the claims of the prompt that hold, and of the scenes in which all do; says them, and what raises them.
+
+    A prompt that cannot be read as claims is said, and has no figures.
+    """
+    from rewards import PromptMatch, RewardContext
+
+    try:
+        output = PromptMatch(settings.prompt)(batch, RewardContext())
+    except InvalidInputError as error:
+        run.say(f"claims of the prompt not checked: {error}")
+        return {}
+    share, whole = (float(output.terms[name].mean()) for name in ("claims_hold", "all_claims_hold"))
+    hint = "" if settings.claim_guidance or whole > 0.9 else "; claim_guidance=2 moves objects toward the claims"
+    run.say(f"prompt: {share:.0%} of the claims hold, all of them in {whole:.0%} of the scenes{hint}")
+    return {"prompt": {"claims_hold": share, "all_claims_hold": whole}}
 
 
 def _without_geometry(settings: SampleConfig, scene_type: SceneType, run: Run) -> SampleConfig:

@@ -44,11 +44,15 @@ def object_counts(batch: SceneBatch) -> dict[str, float]:
     return {"mean": float(counts.double().mean()), "min": int(counts.min()), "max": int(counts.max())}
 
 
-def reward_figures(reward: Any, batch: SceneBatch, pool: PhysicsPool | None, run: Run) -> dict[str, Any]:
-    """Mean, spread and validity of a reward over the scenes, and the means of its terms."""
+def reward_figures(
+    reward: Any, batch: SceneBatch, prompt: str | None, pool: PhysicsPool | None, run: Run
+) -> dict[str, Any]:
+    """Mean, spread and validity of a reward over scenes made for ``prompt``, and the means of its terms."""
     from rewards import RewardContext, evaluate_reward, reward_name
 
-    output = evaluate_reward(reward, batch, RewardContext(pool=pool), strict=True)
+    output = evaluate_reward(
+        reward, batch, RewardContext(None if prompt is None else (prompt,) * len(batch), pool), strict=True
+    )
     valid = output.is_valid
     value = output.value[valid].double()
     figures: dict[str, Any] = {"name": reward_name(reward), "valid": int(valid.sum())}

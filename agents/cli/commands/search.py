@@ -79,6 +79,8 @@ def run(settings: SearchKeys, run: Run) -> None:
             f"objective='{{name: weighted_sum, rewards: [{metrics['objective']}], offset: {-low:.4g}}}' "
             f"objective_scale={-1.1 * low:.4g}"
         )
+    if settings.baseline and "best_of" not in metrics and metrics["stopped"] in (None, "time"):
+        run.say("the baseline, as many independent samples, is left out: max_seconds would end before it does")
     if metrics["stopped"] == "time":
         run.say(f"ended after max_seconds={search.max_seconds:g}; the same command with more time goes on")
     run.say(f"written to {run.directory}")

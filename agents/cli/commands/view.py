@@ -61,12 +61,13 @@ def run(settings: ViewConfig, run: Run) -> None:
     """Write the page, and say where it is."""
     from scene_envs.render import write_viewer
 
-    batch, captions, title = _gather(settings)
+    batch, captions, title, has_more = _gather(settings)
     path = write_viewer(batch, run.directory / "viewer.html", captions=captions, title=settings.title or title)
     draw_scenes(batch, settings.pictures, run, "gallery.png")
     size = path.stat().st_size
     run.write_metrics({"scenes": len(batch), "objects": object_counts(batch), "bytes": size})
-    run.say(f"{len(batch)} scenes, {size / 1e6:.1f} MB; open in any browser: {path}")
+    others = ", the others are left out (count=, first=)" if has_more or settings.first else ""
+    run.say(f"{len(batch)} scenes, {size / 1e6:.1f} MB{others}; open in any browser: {path}")
     if settings.open:
         import webbrowser
 
@@ -74,22 +75,22 @@ def run(settings: ViewConfig, run: Run) -> None:
             run.say("no browser was found to open it in")
 
 
-def _gather(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
-    """The scenes to show, their captions if they have any, and a title."""
+def _gather(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str, bool]:
+    """The scenes to show, their captions if they have any, a title, and whether there are more scenes."""
     if settings.scenes:
         return _read(settings)
     if settings.prior:
         batch = draw(load_prior(settings), settings, settings.count)
-        return batch, None, f"Samples of {Path(settings.prior).name}"
+        return batch, None, f"Samples of {Path(settings.prior).name}", False
     import numpy as np
 
     from scene_envs.grammars import get_grammar
 
     batch = get_grammar(settings.scene).sample(np.random.default_rng(settings.seed), settings.count)
-    return batch, None, f"Grammar {settings.scene}"
+    return batch, None, f"Grammar {settings.scene}", False
 
 
-def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
+def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str, bool]:
     """Scenes ``first`` to ``first + count`` of a scene file or a dataset, whose captions are its prompts."""
     from scene_envs.datasets import SceneDataset, load_scenes
 
@@ -99,9 +100,10 @@ def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str]:
         everything, captions = load_scenes(path), None
         total, batch = len(everything), everything[chosen]
     else:
-        dataset = SceneDataset.load(path, scene_type=settings.scene or None, limit=chosen.stop)
+        dataset = SceneDataset.load(path, scene_type=settings.scene or None, limit=chosen.stop + 1)
         total, captions = len(dataset), dataset.prompts[chosen]
         batch = dataset.batch(chosen)
     if len(batch) == 0:
         raise InvalidInputError(f"view: first={settings.first} is beyond the {total} scenes of {str(path)!r}")
-    return batch, captions, path.name if path.suffix == ".parquet" or path.is_dir() else str(path.parent.name)
+    title = path.name if path.suffix == ".parquet" or path.is_dir() else path.parent.name
+    return batch, captions, title, total > chosen.stop
