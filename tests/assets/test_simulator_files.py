@@ -88,7 +88,11 @@ def test_a_cabinet_is_one_body_as_mujoco_weighs_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.linalg.eigvalsh(asset.inertia), moments, rtol=1e-9)
     assert not asset.static
     assert len(asset.fine) == 2
-    for words in ("movable joints frozen at zero: hinge", "'floor' of the world is left out", "friction of geoms"):
+    for words in (
+        "movable joints frozen at zero: hinge",
+        "'floor', a plane of body 'world', is left out",
+        "friction of",
+    ):
         assert words in said(tmp_path)
     fixed = listed(tmp_path, "it.xml", CABINET.replace("<freejoint/>", ""))
     assert fixed.static
@@ -212,4 +216,60 @@ def test_a_file_that_mujoco_wrote_is_read(tmp_path: Path) -> None:
         listed(tmp_path, "it.usda", file.read_text())
     text = file.read_text().replace('upAxis = "Z"', 'upAxis = "Z"\n    metersPerUnit = 1', 1)
     asset = listed(tmp_path, "it.usda", text)
-    print(asset.mass, asset.bounds, said(tmp_path))
+    np.testing.assert_allclose(asset.bounds[1] - asset.bounds[0], [2, 2, 2], atol=1e-9)
+    assert asset.mass == pytest.approx(500 * 8)
+
+
+def test_colours_of_faces_and_a_left_handed_mirrored_mesh(tmp_path: Path) -> None:
+    """USD keeps linear colours: 0.2159 is 128 of 255 in sRGB. Faces of a mirror face outward again."""
+    pytest.importorskip("pxr")
+    box = """def Mesh "m" (prepend apiSchemas = ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"])
+    {
+        uniform token orientation = "leftHanded"
+        uniform token subdivisionScheme = "none"
+        uniform token physics:approximation = "none"
+        int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
+        int[] faceVertexIndices = [0, 1, 3, 2, 4, 6, 7, 5, 0, 4, 5, 1, 2, 3, 7, 6, 0, 2, 6, 4, 1, 5, 7, 3]
+        point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 1)]
+        color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (0, 0, 0), (0.2159, 0, 0)] (
+            interpolation = "uniform"
+        )
+        double3 xformOp:scale = (-0.1, 0.2, 0.3)
+        uniform token[] xformOpOrder = ["xformOp:scale"]
+    }"""
+    for text in (usd(box), usd(box.replace("-0.1", "0.1"))):
+        asset = listed(tmp_path, "it.usda", text)
+        assert asset.mass == pytest.approx(1000 * 0.1 * 0.2 * 0.3)
+        shown = {tuple(color) for color in asset.visual.visual.vertex_colors[:, :3].tolist()}
+        assert (128, 0, 0) in shown
+        assert len(shown) == 6
+        assert asset.visual.volume == pytest.approx(0.006)
+
+
+@pytest.mark.parametrize("axis", ["X", "Y", "Z"])
+@pytest.mark.parametrize("kind", ["Cylinder", "Capsule"])
+def test_rods_of_usd_lie_along_their_axis(tmp_path: Path, kind: str, axis: str) -> None:
+    pytest.importorskip("pxr")
+    rod = f"""def {kind} "rod" (prepend apiSchemas = ["PhysicsCollisionAPI"])
+    {{
+        double radius = 0.05
+        double height = 0.3
+        uniform token axis = "{axis}"
+    }}"""
+    asset = listed(tmp_path, "it.usda", usd(rod, "float physics:density = 700"))
+    ball = 4 / 3 * np.pi * 0.05**3 * (kind == "Capsule")
+    assert asset.mass == pytest.approx(700 * (np.pi * 0.05**2 * 0.3 + ball), rel=1e-6)
+    assert int(np.ptp(asset.bounds, axis=0).argmax()) == "XYZ".index(axis)
+    assert int(np.diag(asset.inertia).argmin()) == "XYZ".index(axis)
+
+
+def test_a_folder_takes_models_and_not_what_they_use(tmp_path: Path) -> None:
+    import trimesh
+
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "meshes" / "b.stl")
+    text = '<mujoco><compiler meshdir="meshes"/><asset><mesh name="b" file="b.stl"/></asset><worldbody><body>'
+    (tmp_path / "cup.xml").write_text(f'{text}<freejoint/><geom type="mesh" mesh="b"/></body></worldbody></mujoco>')
+    (tmp_path / "package.xml").write_text("<package><name>p</name></package>")
+    assert load_library(tmp_path).names == ("cup",)
+    assert load_library(tmp_path)[0].mass == pytest.approx(1.0, rel=1e-6)  # MuJoCo's default density, 1000 kg/m3

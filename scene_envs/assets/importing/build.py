@@ -381,14 +381,9 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
 
 def _read(path: Path) -> Model:
     suffix = path.suffix.lower()
-    if suffix == ".urdf":
-        return read_urdf(path)
-    if suffix == ".sdf":
-        return read_sdf(path)
-    if suffix == ".xml":
-        return read_mjcf(path)
-    if suffix.startswith(".usd"):
-        return read_usd(path)
+    readers = {".urdf": read_urdf, ".sdf": read_sdf, ".xml": read_mjcf}
+    if reader := read_usd if suffix.startswith(".usd") else readers.get(suffix):
+        return reader(path)
     shape = Shape("mesh", (1.0, 1.0, 1.0), np.eye(4), "the mesh", path)
     shape = dataclasses.replace(shape, pose=pose_of(np.zeros(3), meshes_of(shape)[0].metadata["upright"]))
     return Model(visuals=(shape,), collisions=(shape,))

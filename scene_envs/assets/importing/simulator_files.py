@@ -26,11 +26,8 @@ from scene_envs.assets.importing.solids import solid_of
 from scene_envs.assets.shapes import MassProperties
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 
-_LEFT_OUT = {
-    "nu": "actuators", "nsensor": "sensors", "ntendon": "tendons", "neq": "equality constraints", "nflex": "flexes",
-    "nskin": "skins",
-}  # fmt: skip
-"""What MuJoCo knows and an asset does not, by the size that counts it."""
+_LEFT_OUT = ["nu actuators", "nsensor sensors", "ntendon tendons", "neq constraints", "nflex flexes", "nskin skins"]
+"""The sizes of a model in MuJoCo that count what an asset does not have."""
 
 
 def read_mjcf(path: Path) -> Model:
@@ -55,31 +52,27 @@ def read_mjcf(path: Path) -> Model:
     base = np.linalg.inv(pose_of(data.xpos[root], data.xmat[root].reshape(3, 3)))
     visuals: list[Shape] = []
     collisions: list[Shape] = []
-    notes: list[str] = []
+    notes = [] if model.ntex == 0 else [f"not read: {model.ntex} texture(s); what has one has the colour of the asset"]
     for geom in range(model.ngeom):
         name = f"geom {model.geom(geom).name or geom!r}"
-        if int(model.geom_bodyid[geom]) not in bodies:
-            notes.append(f"{name} of the world is left out")
-            continue
         shape = _geom(model, geom, base @ pose_of(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)), path, name)
-        if shape is None:
-            notes.append(f"{name} is a {mujoco.mjtGeom(model.geom_type[geom]).name[7:].lower()}, which is left out")
+        if shape is None or int(model.geom_bodyid[geom]) not in bodies:
+            kind, body = mujoco.mjtGeom(model.geom_type[geom]).name[7:].lower(), model.geom_bodyid[geom]
+            notes.append(f"{name}, a {kind} of body {model.body(body).name!r}, is left out")
             continue
         if collides := bool(model.geom_contype[geom] | model.geom_conaffinity[geom]):
             collisions.append(shape)
         if model.geom_group[geom] <= 2 or not collides:  # MuJoCo draws the groups 0 to 2
             visuals.append(shape)
     inertials = []
-    for body in bodies:
-        if model.body_mass[body] > 0:
-            pose = base @ pose_of(data.xipos[body], data.ximat[body].reshape(3, 3))
-            own = MassProperties(float(model.body_mass[body]), np.zeros(3), np.diag(model.body_inertia[body]))
-            inertials.append(moved_inertial(pose, own))
-    notes += [f"not read: {what} ({getattr(model, key)})" for key, what in _LEFT_OUT.items() if getattr(model, key)]
-    if len(np.unique(model.geom_friction, axis=0)) > 1 or (model.ngeom and model.geom_friction[0, 0] != 1.0):
+    for body in (body for body in bodies if model.body_mass[body] > 0):
+        pose = base @ pose_of(data.xipos[body], data.ximat[body].reshape(3, 3))
+        own = MassProperties(float(model.body_mass[body]), np.zeros(3), np.diag(model.body_inertia[body]))
+        inertials.append(moved_inertial(pose, own))
+    counts = [(getattr(model, key), what) for key, what in map(str.split, _LEFT_OUT)]
+    notes += [f"not read: {count} {what}" for count, what in counts if count]
+    if (model.geom_friction[:, 0] != 1.0).any():
         notes.append("not read: friction of geoms, because all objects of a scene have the same")
-    if model.ntex:
-        notes.append(f"not read: {model.ntex} texture(s); surfaces with them have the colour of the asset")
     free = [j for j in range(model.njnt) if model.jnt_type[j] == 0 and model.jnt_bodyid[j] == root]
     held = [j for j in range(model.njnt) if j not in free and model.jnt_bodyid[j] in bodies]
     if movable := [model.joint(j).name or f"joint {j}" for j in held]:
@@ -102,24 +95,18 @@ def _root_body(model: Any, path: Path) -> int:
 
 def _geom(model: Any, geom: int, pose: Array, path: Path, name: str) -> Shape | None:
     """A geom as MuJoCo takes it: meshes collide as their hulls."""
-    kind = int(model.geom_type[geom])
-    size = model.geom_size[geom].astype(float)
-    material = int(model.geom_matid[geom])
+    kind, material, size = int(model.geom_type[geom]), int(model.geom_matid[geom]), model.geom_size[geom].astype(float)
     rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
-    color: Color | None = tuple(np.rint(255.0 * rgba[:3]).astype(int).tolist())
-    if material >= 0 and (model.mat_texid[material] >= 0).any():
-        color = None
+    is_textured = material >= 0 and (model.mat_texid[material] >= 0).any()
+    color = None if is_textured else _one(np.rint(255.0 * rgba[None]))
     if kind == 7:
         import trimesh
 
-        mesh = int(model.geom_dataid[geom])
-        points, faces = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
-        check_triangles(path, int(model.mesh_facenum[mesh]))
-        surface = trimesh.Trimesh(
-            model.mesh_vert[points : points + model.mesh_vertnum[mesh]].astype(float),
-            model.mesh_face[faces : faces + model.mesh_facenum[mesh]],
-            process=False,
-        )
+        mesh = model.mesh(int(model.geom_dataid[geom]))
+        check_triangles(path, int(mesh.facenum[0]))
+        points = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]].astype(float)
+        faces = model.mesh_face[mesh.faceadr[0] :][: mesh.facenum[0]]
+        surface = trimesh.Trimesh(points, faces, process=False)
         return Shape("mesh", (1.0, 1.0, 1.0), pose, name, path, color, True, surface=surface)
     sizes: dict[int, tuple[Any, tuple[float, ...]]] = {
         2: ("sphere", (size[0],)), 3: ("capsule", (size[0], 2 * size[1])), 4: ("ellipsoid", tuple(size)),
@@ -163,9 +150,8 @@ def read_usd(path: Path) -> Model:
     if len(bodies) > 1 and not joints:
         names = ", ".join(str(prim.GetPath()) for prim in bodies)
         raise InvalidInputError(f"{path} holds {len(bodies)} bodies ({names}); an asset is one, so put each in a file")
-    for prim in prims:
-        if prim.IsA(UsdGeom.Gprim):
-            reading.add(prim)
+    for prim in (prim for prim in prims if prim.IsA(UsdGeom.Gprim)):
+        reading.add(prim)
     for body in bodies:
         reading.weigh(body)
     notes = list(dict.fromkeys(reading.notes))
@@ -176,8 +162,8 @@ def read_usd(path: Path) -> Model:
     if static:
         why = "a joint holds it at the world" if held else "it has colliders and no rigid body"
         notes.append(f"{why}: it is welded (`welded: false` makes it free)")
-    collisions = tuple(shape for _, shape in reading.collisions)
-    return Model(tuple(reading.visuals), collisions, tuple(reading.inertials), static, tuple(notes))
+    shapes = tuple(reading.visuals), tuple(shape for _, shape in reading.collisions)
+    return Model(*shapes, tuple(reading.inertials), static, tuple(notes))
 
 
 class _Stage:
@@ -209,8 +195,6 @@ class _Stage:
         collides = owner is not None and UsdPhysics.CollisionAPI(owner).GetCollisionEnabledAttr().Get() is not False
         image = UsdGeom.Imageable(prim)
         drawn = image.ComputePurpose() in ("default", "render") and image.ComputeVisibility() != "invisible"
-        if not collides and not drawn:
-            return
         shape = self._mesh(prim, owner) if prim.IsA(UsdGeom.Mesh) else self._primitive(prim)
         if shape is None:
             self.notes.append(f"{prim.GetPath()} is a {prim.GetTypeName()}, which is left out")
@@ -228,8 +212,7 @@ class _Stage:
         corners, counts, points = corners.astype(int), counts.astype(int), found.reshape(-1, 3).astype(float)
         if counts.sum() != len(corners) or not len(corners) or not 0 <= corners.min() <= corners.max() < len(points):
             raise CorruptFileError(f"{self.path}: the faces of {where} do not fit to its points")
-        if prim.GetAttribute("holeIndices").Get():
-            self.notes.append(f"{where}: its holes are filled")
+        self.notes += [f"{where}: its holes are filled"] if prim.GetAttribute("holeIndices").Get() else []
         cut, polygons = cut_polygons(points, corners, counts)
         check_triangles(self.path, len(cut))
         inside_out = (prim.GetAttribute("orientation").Get() == "leftHanded") != (np.linalg.det(matrix) < 0)
@@ -239,14 +222,12 @@ class _Stage:
             surface.visual.face_colors = colors[polygons]
         elif len(colors) == len(points):
             surface.visual.vertex_colors = colors
-        elif len(colors) > 1:
-            self.notes.append(f"{where}: its {len(colors)} colours are not read")
+        else:
+            self.notes += [f"{where}: its {len(colors)} colours are not read"] if len(colors) > 1 else []
         how = owner.GetAttribute("physics:approximation").Get() if owner else None
-        if how in ("boundingCube", "boundingSphere"):
-            self.notes.append(f"{where}: its {how} is taken as its hull")
         is_hull = how in ("convexHull", "boundingCube", "boundingSphere")
-        color = _one(colors)
-        return Shape("mesh", (1.0, 1.0, 1.0), np.eye(4), where, self.path, color, is_hull, surface=surface)
+        self.notes += [f"{where}: its {how} is taken as its hull"] if is_hull and how != "convexHull" else []
+        return Shape("mesh", (1.0,) * 3, np.eye(4), where, self.path, _one(colors), is_hull, surface=surface)
 
     def _primitive(self, prim: Any) -> Shape | None:
         from pxr import UsdGeom
@@ -257,20 +238,20 @@ class _Stage:
         if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-6:
             raise InvalidInputError(f"{self.path}: {where} is sheared; make it a mesh")
         turn = turn * np.sign(np.linalg.det(turn))  # primitives look the same in a mirror
+        pose = pose_of(place, turn)
         if prim.IsA(UsdGeom.Cube):
-            return Shape("box", tuple(_number(prim, "size") * scales), pose_of(place, turn), where, None, color)
+            return Shape("box", tuple(_number(prim, "size") * scales), pose, where, None, color)
         if prim.IsA(UsdGeom.Sphere):
-            size = tuple(_number(prim, "radius") * scales)
-            return Shape("ellipsoid", size, pose_of(place, turn), where, None, color)
-        if not (prim.IsA(UsdGeom.Cylinder) or prim.IsA(UsdGeom.Capsule)):
+            return Shape("ellipsoid", tuple(_number(prim, "radius") * scales), pose, where, None, color)
+        if prim.GetTypeName() not in ("Cylinder", "Capsule"):
             return None
+        kind: Kind = "cylinder" if prim.IsA(UsdGeom.Cylinder) else "capsule"
         order = np.roll(np.arange(3), -"XYZ".index(prim.GetAttribute("axis").Get()) - 1)  # the axis last
-        scales, turn = scales[order], turn[:, order]
-        if np.ptp(scales[: 2 if prim.IsA(UsdGeom.Cylinder) else 3]) > 1e-6 * scales.max():
+        scales = scales[order]
+        if np.ptp(scales[: 2 if kind == "cylinder" else 3]) > 1e-6 * scales.max():
             raise InvalidInputError(f"{self.path}: {where} is scaled unevenly; make it a mesh")
         size = (float(_number(prim, "radius") * scales[0]), float(_number(prim, "height") * scales[2]))
-        kind: Kind = "cylinder" if prim.IsA(UsdGeom.Cylinder) else "capsule"
-        return Shape(kind, size, pose_of(place, turn), where, None, color)
+        return Shape(kind, size, pose_of(place, turn[:, order]), where, None, color)
 
     def _colors(self, prim: Any) -> Any:
         """(N, 3) in 0..255 from the linear colours of a prim, N 0 without any."""
