@@ -273,3 +273,28 @@ def test_a_folder_takes_models_and_not_what_they_use(tmp_path: Path) -> None:
     (tmp_path / "package.xml").write_text("<package><name>p</name></package>")
     assert load_library(tmp_path).names == ("cup",)
     assert load_library(tmp_path)[0].mass == pytest.approx(1.0, rel=1e-6)  # MuJoCo's default density, 1000 kg/m3
+
+
+def test_densities_of_materials_and_hulls_of_open_meshes(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    text = """def Material "oak" (prepend apiSchemas = ["PhysicsMaterialAPI"])
+    {
+        float physics:density = 700
+        float physics:staticFriction = 0.4
+    }
+    def Mesh "tent" (prepend apiSchemas = ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI", "MaterialBindingAPI"])
+    {
+        uniform token physics:approximation = "convexHull"
+        rel material:binding:physics = </it/oak>
+        int[] faceVertexCounts = [3, 3, 3]
+        int[] faceVertexIndices = [0, 1, 3, 1, 2, 3, 2, 0, 3]
+        point3f[] points = [(0, 0, 0), (0.3, 0, 0), (0, 0.3, 0), (0, 0, 0.3)]
+    }"""
+    assert listed(tmp_path, "it.usda", usd(text)).mass == pytest.approx(700 * 0.3**3 / 6, rel=1e-6)
+    assert "friction of materials" in said(tmp_path)
+
+
+def test_points_that_place_prototypes_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    with pytest.raises(InvalidInputError, match="point instancer"):
+        listed(tmp_path, "it.usda", usd('def PointInstancer "many" {}'))

@@ -13,7 +13,6 @@ from scene_envs.assets.importing.limits import check_file, check_triangles
 from scene_envs.assets.importing.mesh_files import (
     Y_UP,
     Color,
-    Kind,
     Model,
     Shape,
     cut_polygons,
@@ -150,6 +149,10 @@ def read_usd(path: Path) -> Model:
     if len(bodies) > 1 and not joints:
         names = ", ".join(str(prim.GetPath()) for prim in bodies)
         raise InvalidInputError(f"{path} holds {len(bodies)} bodies ({names}); an asset is one, so put each in a file")
+    if many := [prim.GetPath() for prim in prims if prim.IsA(UsdGeom.PointInstancer)]:
+        raise InvalidInputError(
+            f"{path}: {many[0]} is a point instancer, which is not read; make its instances prims"
+        )
     for prim in (prim for prim in prims if prim.IsA(UsdGeom.Gprim)):
         reading.add(prim)
     for body in bodies:
@@ -158,12 +161,11 @@ def read_usd(path: Path) -> Model:
     if movable := [j.GetPrim().GetName() for j in joints if not j.GetPrim().IsA(UsdPhysics.FixedJoint)]:
         notes.append(f"movable joints frozen where they are: {', '.join(movable)}")
     held = any(not end.GetTargets() for joint in joints for end in (joint.GetBody0Rel(), joint.GetBody1Rel()))
-    static = True if held or (reading.collisions and not bodies) else None
-    if static:
-        why = "a joint holds it at the world" if held else "it has colliders and no rigid body"
+    why = "it has colliders and no rigid body" if reading.collisions and not bodies else ""
+    if why := "a joint holds it at the world" if held else why:
         notes.append(f"{why}: it is welded (`welded: false` makes it free)")
     shapes = tuple(reading.visuals), tuple(shape for _, shape in reading.collisions)
-    return Model(*shapes, tuple(reading.inertials), static, tuple(notes))
+    return Model(*shapes, tuple(reading.inertials), bool(why) or None, tuple(notes))
 
 
 class _Stage:
@@ -230,28 +232,23 @@ class _Stage:
         return Shape("mesh", (1.0,) * 3, np.eye(4), where, self.path, _one(colors), is_hull, surface=surface)
 
     def _primitive(self, prim: Any) -> Shape | None:
-        from pxr import UsdGeom
-
         where, color, (matrix, place) = str(prim.GetPath()), _one(self._colors(prim)), self._matrix(prim)
-        scales = np.linalg.norm(matrix, axis=0)
-        turn = matrix / scales
+        kind, scales = prim.GetTypeName(), np.linalg.norm(matrix, axis=0)
+        turn = matrix / scales * np.sign(np.linalg.det(matrix))  # primitives look the same in a mirror
         if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-6:
             raise InvalidInputError(f"{self.path}: {where} is sheared; make it a mesh")
-        turn = turn * np.sign(np.linalg.det(turn))  # primitives look the same in a mirror
-        pose = pose_of(place, turn)
-        if prim.IsA(UsdGeom.Cube):
-            return Shape("box", tuple(_number(prim, "size") * scales), pose, where, None, color)
-        if prim.IsA(UsdGeom.Sphere):
-            return Shape("ellipsoid", tuple(_number(prim, "radius") * scales), pose, where, None, color)
-        if prim.GetTypeName() not in ("Cylinder", "Capsule"):
+        if kind == "Cube":
+            return Shape("box", tuple(_number(prim, "size") * scales), pose_of(place, turn), where, None, color)
+        if kind == "Sphere":
+            return Shape("ellipsoid", tuple(_number(prim, "radius") * scales), pose_of(place, turn), where, None, color)
+        if kind not in ("Cylinder", "Capsule"):
             return None
-        kind: Kind = "cylinder" if prim.IsA(UsdGeom.Cylinder) else "capsule"
         order = np.roll(np.arange(3), -"XYZ".index(prim.GetAttribute("axis").Get()) - 1)  # the axis last
-        scales = scales[order]
-        if np.ptp(scales[: 2 if kind == "cylinder" else 3]) > 1e-6 * scales.max():
+        scales, pose = scales[order], pose_of(place, turn[:, order])
+        if np.ptp(scales[: 2 if kind == "Cylinder" else 3]) > 1e-6 * scales.max():
             raise InvalidInputError(f"{self.path}: {where} is scaled unevenly; make it a mesh")
         size = (float(_number(prim, "radius") * scales[0]), float(_number(prim, "height") * scales[2]))
-        return Shape(kind, size, pose_of(place, turn[:, order]), where, None, color)
+        return Shape("cylinder" if kind == "Cylinder" else "capsule", size, pose, where, None, color)
 
     def _colors(self, prim: Any) -> Any:
         """(N, 3) in 0..255 from the linear colours of a prim, N 0 without any."""
@@ -265,7 +262,8 @@ class _Stage:
                 values = [diffuse.Get()]
             if shader.GetAttribute("inputs:file"):
                 self.notes.append(f"not read: the textures of {material.GetPath()}")
-        if material and material.GetPrim().GetAttribute("physics:dynamicFriction").HasAuthoredValue():
+        rubs = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
+        if _number(rubs, "physics:dynamicFriction") or _number(rubs, "physics:staticFriction"):
             self.notes.append("not read: friction of materials, because all objects of a scene have the same")
         linear = np.clip(np.array(values, dtype=float).reshape(-1, 3), 0.0, 1.0)
         shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
@@ -273,17 +271,21 @@ class _Stage:
 
     def weigh(self, body: Any) -> None:
         """Mass properties of a body by the rules of UsdPhysics: its own, else those of its colliders."""
+        from pxr import UsdPhysics, UsdShade
+
         matrix, place = self._matrix(body)
         names = ("mass", "centerOfMass", "diagonalInertia", "principalAxes")
         mass, center, moments, axes = (body.GetAttribute(f"physics:{name}").Get() for name in names)
         has_center, has_moments = center is not None and np.isfinite(center).all(), moments is not None and any(moments)
-        own = [(prim, shape) for prim, shape in self.collisions if body in _and_above(prim)]
+        nearest = [next((p for p in _and_above(q) if p.HasAPI(UsdPhysics.RigidBodyAPI)), q) for q, _ in self.collisions]
+        own = [found for found, owner in zip(self.collisions, nearest, strict=True) if owner == body]
         found = MassProperties((mass or 0.0) * self.kilograms, place, np.zeros((3, 3)))
         if own and not (mass and has_center and has_moments):
             solids = []
             for prim, shape in own:
                 solid, weight = solid_of(shape), _number(prim, "physics:mass") * self.kilograms
-                density = _number(prim, "physics:density") or _number(body, "physics:density")
+                material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
+                density = next(filter(None, (_number(p, "physics:density") for p in (prim, body, material))), 0.0)
                 density *= self.kilograms / self.unit**3
                 solids.append(heavier(solid, weight / solid.mass if weight else density or 1000.0))
             filled = merged_inertial(solids)
@@ -304,7 +306,7 @@ def _one(colors: Any) -> Color | None:
 
 def _number(prim: Any, name: str) -> float:
     """A number of a prim; 0 where it has none."""
-    return float((prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None) or 0.0)
+    return float((prim.GetAttribute(name).Get() if prim and prim.HasAttribute(name) else None) or 0.0)
 
 
 def _and_above(prim: Any) -> list[Any]:

@@ -445,6 +445,8 @@ def solid_of(shape: Shape) -> MassProperties:
     """The solid of a shape at 1 kg/m^3, in closed form for primitives; InvalidInputError for a mesh that is open."""
     if shape.kind == "mesh":
         bodies = _closed([piece for mesh in _surfaces(shape) for piece in mesh.split(only_watertight=False)])
+        if not bodies and shape.is_convex:
+            bodies = [convex_hull(np.concatenate([mesh.vertices for mesh in meshes_of(shape)]))]
         if not bodies:
             raise InvalidInputError(f"{shape.path}: {shape.where} has no mass, as it is not closed; give a mass")
         return mass_properties(bodies, volume(bodies))
