@@ -15,16 +15,16 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from agents.cli import main
 from agents.planning import PlannerSettings, PlanResult, Searchable, SearchBudget, register_planner
-from agents.planning.ledger import Candidate, Progress, SteeredProblem, check_at_least
+from agents.planning.ledger import Candidate, Progress, SteeredProblem
 from scene_envs import SceneBatch
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Count, InvalidInputError, at_least
 
 
 @dataclass(eq=False)
@@ -96,15 +96,11 @@ class UCTPlanner(PlannerSettings):
 
     name: str = "uct"
     widens = True
-    exploration: float = 0.05
-    parallel: int | None = None
-    children: int | None = None
-    widening: float = 0.5
-    max_loss: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_at_least(self, 1, "parallel", "children")
-        check_at_least(self, 0, "exploration", "widening", "max_loss")
+    exploration: Annotated[float, at_least(0)] = 0.05
+    parallel: Count | None = None
+    children: Count | None = None
+    widening: Annotated[float, at_least(0)] = 0.5
+    max_loss: Annotated[float, at_least(0)] = 1.0
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions on the tree below the problem's current state."""
@@ -254,15 +250,14 @@ class TreeOverStepsPlanner(PlannerSettings):
     name: str = "tree_over_steps"
     widens = True
     steers = True
-    children: int | None = None
+    children: Count | None = None
     stops: tuple[float, ...] = (0.5, 0.7)
-    rounds: int = 3
-    exploration: float = 0.05
-    widening: float = 0.5
+    rounds: Count = 3
+    exploration: Annotated[float, at_least(0)] = 0.05
+    widening: Annotated[float, at_least(0)] = 0.5
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "children", "rounds")
-        check_at_least(self, 0, "exploration", "widening")
+        super().__post_init__()
         if not self.stops or any(not 0 < a < b for a, b in zip(self.stops, [*self.stops[1:], 1.0], strict=True)):
             raise InvalidInputError(f"planner {self.name}: stops={list(self.stops)} are no increasing shares, in 0..1")
 

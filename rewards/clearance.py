@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Checked, Positive
 from scene_envs.scene import SceneBatch
 
 
 @register_reward("clearance")
 @dataclass(frozen=True)
-class Clearance:
+class Clearance(Checked):
     """Mean gap of the free objects to their nearest neighbours, over the gap that is wanted: from 0 to 1.
 
     The gap is the distance of the convex parts; it is 0 where objects touch or overlap. An object and what carries it,
@@ -29,13 +28,10 @@ class Clearance:
     """
 
     name: ClassVar[str] = "clearance"
+    place = "clearance: "
     maximum: ClassVar[float] = 1.0
     averages_objects: ClassVar[bool] = True
-    wanted: float = 0.03
-
-    def __post_init__(self) -> None:
-        if not 0 < self.wanted < math.inf:
-            raise InvalidInputError(f"clearance: wanted={self.wanted} must be a positive number of metres")
+    wanted: Positive = 0.03
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """``per_object`` (B, N) is the gap over ``wanted``, at most 1. Terms: ``smallest_gap``, m, at most

@@ -12,7 +12,7 @@ from torch import Tensor
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
 from scene_envs.arrays import Array, Index
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Checked, Count
 from scene_envs.scene import SceneBatch, hull_corners
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _PARALLEL = 1e-12
 
 @register_reward("clutter")
 @dataclass(frozen=True)
-class Clutter:
+class Clutter(Checked):
     """Share of the supporting surfaces that is covered by objects, from 0 to 1.
 
     A surface is the top or a tier of a welded object; its area is that of the object's outline from above. Free objects
@@ -38,12 +38,9 @@ class Clutter:
     """
 
     name: ClassVar[str] = "clutter"
+    place = "clutter: "
     maximum: ClassVar[float] = 1.0
-    lines: int = 128
-
-    def __post_init__(self) -> None:
-        if self.lines < 1:
-            raise InvalidInputError(f"clutter: lines={self.lines} must be at least 1")
+    lines: Count = 128
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Measure covered lengths along parallel lines over each surface.

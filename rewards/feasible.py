@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Checked, Positive
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
@@ -77,15 +77,9 @@ def _keys(batch: SceneBatch, limits: dict[str, float]) -> list[bytes]:
     return [hashlib.blake2b(scene.tobytes() + common, digest_size=16).digest() for scene in scenes]
 
 
-def _require_positive(reward: FeasibleObjects | Stability, *settings: str) -> None:
-    for setting in settings:
-        if not getattr(reward, setting) > 0:
-            raise InvalidInputError(f"{reward.name}: {setting}={getattr(reward, setting)} must be positive")
-
-
 @register_reward("feasible_objects")
 @dataclass(frozen=True)
-class FeasibleObjects:
+class FeasibleObjects(Checked):
     """Number of free objects in the workspace that neither penetrate another object nor move when simulated.
 
     An object is feasible if its frame is in the workspace, it overlaps no other object by more than
@@ -100,13 +94,11 @@ class FeasibleObjects:
     """
 
     name: ClassVar[str] = "feasible_objects"
-    max_penetration: float = 1e-3
-    max_displacement: float = 1e-3
-    max_rotation: float = 1e-2
-    duration: float = 0.1
-
-    def __post_init__(self) -> None:
-        _require_positive(self, *_LIMITS)
+    place = "feasible_objects: "
+    max_penetration: Positive = 1e-3
+    max_displacement: Positive = 1e-3
+    max_rotation: Positive = 1e-2
+    duration: Positive = 0.1
 
     def maximum(self, slots: int, free_slots: int) -> float:
         return free_slots
@@ -178,7 +170,7 @@ class FeasibleShare(FeasibleObjects):
 
 @register_reward("stability")
 @dataclass(frozen=True)
-class Stability:
+class Stability(Checked):
     """Stillness of the free objects under gravity: their mean score, from 0 to 1 (at rest).
 
     An object that moves by d and turns by a scores ``exp(-(d / scale + a / scale_rotation))``. Objects deeper than
@@ -193,15 +185,13 @@ class Stability:
     """
 
     name: ClassVar[str] = "stability"
+    place = "stability: "
     maximum: ClassVar[float] = 1.0
     averages_objects: ClassVar[bool] = True
-    scale: float = 0.01
-    scale_rotation: float = 0.1
-    max_penetration: float = 1e-3
-    duration: float = 0.1
-
-    def __post_init__(self) -> None:
-        _require_positive(self, "scale", "scale_rotation", "max_penetration", "duration")
+    scale: Positive = 0.01
+    scale_rotation: Positive = 0.1
+    max_penetration: Positive = 1e-3
+    duration: Positive = 0.1
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Simulate; rows that physics could not judge are invalid.

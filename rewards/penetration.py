@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
-from scene_envs.errors import unknown_name
+from scene_envs.errors import Checked, OneOf
 from scene_envs.scene import SceneBatch
 
 MEASURES = ("total", "deepest")
@@ -20,7 +20,7 @@ _TOUCHING = 1e-4
 
 @register_reward("penetration")
 @dataclass(frozen=True)
-class Penetration:
+class Penetration(Checked):
     """Minus the depth in mm to which objects overlap, summed over the pairs of a scene; 0 without overlap.
 
     Needs no simulator. Two welded objects are no pair.
@@ -33,11 +33,7 @@ class Penetration:
     """
 
     name: ClassVar[str] = "penetration"
-    measure: str = "total"
-
-    def __post_init__(self) -> None:
-        if self.measure not in MEASURES:
-            raise unknown_name("measure of penetration", self.measure, MEASURES)
+    measure: Annotated[str, OneOf(MEASURES, "measure of penetration")] = "total"
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Terms: ``total_mm``, ``deepest_mm``, and ``overlapping_pairs`` deeper than 0.1 mm.

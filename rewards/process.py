@@ -31,7 +31,15 @@ from rewards.registry import (
     reward_name,
 )
 from scene_envs.envs.settings import takes
-from scene_envs.errors import InvalidInputError, RewardError, RewardTimeoutError, SceneEnvsError, UnknownNameError
+from scene_envs.errors import (
+    Checked,
+    InvalidInputError,
+    Positive,
+    RewardError,
+    RewardTimeoutError,
+    SceneEnvsError,
+    UnknownNameError,
+)
 from scene_envs.physics import PhysicsPool, make_pool
 from scene_envs.registry import describe_error
 from scene_envs.scene import SceneBatch
@@ -40,7 +48,7 @@ from scene_envs.workers import START_UP, Process, WorkerFailure
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProcessSettings:
+class ProcessSettings(Checked):
     """Settings of a reward that runs in a worker process.
 
     Attributes:
@@ -54,17 +62,11 @@ class ProcessSettings:
         InvalidInputError: a limit is no positive number.
     """
 
-    timeout: float = 60.0
-    memory: float = 1.0
+    timeout: Positive = 60.0
+    memory: Positive = 1.0
     seed: int = 0
     workers: int = 0
     physics: str = "auto"
-
-    def __post_init__(self) -> None:
-        for name in ("timeout", "memory"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < float("inf"):
-                raise InvalidInputError(f"{name}={value!r} must be a positive number")
 
 
 class IsolatedReward:

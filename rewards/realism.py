@@ -14,14 +14,14 @@ from torch import Generator, Tensor
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
 from scene_envs.envs.scoring import resolve_prior
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Checked, Count, InvalidInputError
 from scene_envs.protocols import LikelihoodPriorLike
 from scene_envs.scene import SceneBatch
 
 
 @register_reward("realism")
 @dataclass(frozen=True)
-class Realism:
+class Realism(Checked):
     """Minus the training loss of a scene under a frozen prior, at fixed timesteps and noise; 0 at most.
 
     The loss is a bound on the negative log-likelihood up to weights (Ho et al. 2020, Eq. 14). Every scene gets the same
@@ -35,13 +35,10 @@ class Realism:
     """
 
     name: ClassVar[str] = "realism"
+    place = "realism: "
     prior: Any = None
-    levels: int = 8
+    levels: Count = 8
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.levels < 1:
-            raise InvalidInputError(f"realism: levels={self.levels} must be at least 1")
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Evaluate the prior ``levels`` times per scene. No terms and no credit per object.

@@ -1,9 +1,16 @@
-"""Exceptions of SceneEnvs; every message names the value, the place and the remedy."""
+"""Exceptions of SceneEnvs, whose messages name the value, the place and the remedy, and conditions on values."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, Any, get_args, get_type_hints
+
+_MAX_NUMBER = 1e30
 
 
 class SceneEnvsError(Exception):
@@ -61,3 +68,78 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
     near = last or difflib.get_close_matches(name, names, n=1, cutoff=0.4)
     hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else "."
     return UnknownNameError(f"unknown {kind} {name!r}{hint} Known: {', '.join(names) or '(none)'}.")
+
+
+def shown(value: Any) -> str:
+    """A value in a message, of bounded length; Python refuses to write integers of thousands of digits."""
+    return "a very large number" if isinstance(value, int) and abs(value) > _MAX_NUMBER else repr(value)[:200]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Condition on the value of a field; ``rule`` ends the message of the InvalidInputError. None is accepted."""
+
+    holds: Callable[[Any], bool]
+    rule: str
+
+    def check(self, place: str, name: str, value: Any, default: Any) -> None:
+        """Raise unless it holds for the field ``name``, whose ``default`` says whether null is a choice."""
+        with suppress(TypeError):  # no number
+            if value is None or self.holds(value):
+                return
+        null = ", or null" if default is None else ""
+        raise InvalidInputError(f"{place}{name}={shown(value)} {self.rule}{null}")
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Condition that a field is one of the ``known`` words; the UnknownNameError calls it ``what`` or by its name."""
+
+    known: tuple[str, ...]
+    what: str = ""
+
+    def check(self, place: str, name: str, value: Any, default: Any) -> None:
+        """Raise unless the word is known."""
+        if value not in self.known:
+            raise unknown_name(self.what or name, str(value), self.known)
+
+
+def at_least(low: float) -> Limit:
+    """Condition of a finite number of at least ``low``."""
+    return Limit(lambda value: low <= value < math.inf, f"must be at least {low}")
+
+
+FINITE = Limit(math.isfinite, "must be a finite number")
+BELOW_ONE = Limit(lambda value: 0 <= value < 1, "must lie in [0, 1)")
+Positive = Annotated[float, Limit(lambda value: 0 < value < math.inf, "must be a positive number")]
+Count = Annotated[int, at_least(1)]
+Natural = Annotated[int, at_least(0)]
+Seed = Annotated[int, Limit(lambda seed: 0 <= seed < 2**63, "must be from 0 to 2^63 - 1")]
+Share = Annotated[float, Limit(lambda value: 0 <= value <= 1, "is outside 0..1: it is a share")]
+
+
+class Checked:
+    """Base of dataclasses with conditions in the annotations of their fields, as ``Count | None``, checked when made.
+
+    >>> @dataclass
+    ... class Cup(Checked):
+    ...     sides: Count = 6
+    >>> Cup(sides=0)
+    Traceback (most recent call last):
+    ...
+    scene_envs.errors.InvalidInputError: sides=0 must be at least 1
+    """
+
+    place = ""
+    """What stands in front of the name of a field in messages."""
+
+    def __post_init__(self) -> None:
+        for name, condition in _conditions(type(self)):  # type: ignore[arg-type]
+            condition.check(self.place, name, getattr(self, name), getattr(type(self), name, ""))
+
+
+@cache
+def _conditions(kind: type) -> list[tuple[str, Limit | OneOf]]:
+    hints = get_type_hints(kind, include_extras=True)
+    parts = [(name, part) for name, hint in hints.items() for part in (hint, *get_args(hint))]  # of a union, too
+    return [(name, condition) for name, part in parts for condition in getattr(part, "__metadata__", ())]

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import errno
 import functools
 import itertools
-import math
 import os
 import re
 import sys
@@ -27,12 +25,10 @@ from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import compose, format_rows, help_text, keys_of
 from agents.cli.run_folder import RESUMING, Run, fresh_directory
 from agents.configuration.composition import (
-    PROGRESS_STYLES,
     config_text,
     known_masks,
     known_rewards,
     known_scenes,
-    require_one_of,
 )
 from agents.configuration.prior_names import find_prior, split_name
 from agents.utils.interrupts import Terminated, terminable
@@ -72,19 +68,6 @@ for _names in (["--config-dir"], ["--config"], ["--cfg", "-c"]):
     _FLAGS.add_argument(*_names, default="")
 for _names in (["--allow-local"], ["--multirun", "-m"], ["--help", "-h"]):
     _FLAGS.add_argument(*_names, action="store_true")
-_MINIMA = {
-    "count": 1,
-    "num_steps": 1,
-    "slots": 1,
-    "batch_size": 1,
-    "shard_size": 1,
-    "fill": 0,
-    "first": 0,
-    "pictures": 0,
-    "eta": 0,
-    "friction": 0,
-}
-"""The least that a number may be, where a config's ``LEAST`` does not say otherwise."""
 _DEVICE = (
     r"(auto|cpu|cuda|mps|xpu|hpu|mtia|xla|ipu|hip|ve|vulkan|maia|lazy|meta|privateuseone|npu|mlu|musa|mkldnn|opengl|opencl|"
     r"ideep|fpga)(:\d{1,4})?"
@@ -334,7 +317,6 @@ def _values(word: str) -> list[str]:
 
 def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     """Refuse wrong values that can be found before the work starts; ask before one of the user's files is run."""
-    _check_numbers(settings)
     if (own := getattr(module, "check", None)) is not None:
         own(settings)
     if (prior := getattr(settings, "prior", None)) and isinstance(prior, str):
@@ -353,8 +335,6 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     device = getattr(settings, "device", "auto")
     if not re.fullmatch(_DEVICE, device):
         raise InvalidInputError(f"device={device[:60]!r} is no torch device; give auto, cpu, cuda or cuda:1")
-    if hasattr(settings, "progress"):
-        require_one_of(settings, "progress", PROGRESS_STYLES)
     if (scenes := getattr(settings, "scenes", None)) and isinstance(scenes, str):
         find_scenes(Path(scenes))
     resumed = os.path.exists(Path(str(getattr(settings, "output", "") or "."), "checkpoint.pt"))
@@ -375,20 +355,6 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
                 allow_local_rewards(path)
     if device not in ("auto", "cpu"):  # neither needs torch to be checked
         resolve_device(device)
-
-
-def _check_numbers(settings: Any) -> None:
-    workers = getattr(settings, "workers", 0)
-    if isinstance(workers, int) and workers < 0:
-        raise InvalidInputError(f"workers={workers}: give a number of processes, 0 for none")
-    for key, least in {**_MINIMA, **getattr(settings, "LEAST", {})}.items():
-        value = getattr(settings, key, None)
-        if isinstance(value, int | float) and not least <= value < math.inf:
-            may_be_none = any(field.name == key and field.default is None for field in dataclasses.fields(settings))
-            null = ", or null" if may_be_none else ""
-            raise InvalidInputError(f"{key}={value} must be at least {least}{null}")
-    if isinstance(seed := getattr(settings, "seed", 0), int) and not 0 <= seed < 2**63:
-        raise InvalidInputError(f"seed={seed} must be from 0 to 2^63 - 1")
 
 
 def _check_name(kind: str, value: Any, known: Callable[[], Sequence[str]]) -> None:

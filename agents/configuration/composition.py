@@ -17,10 +17,10 @@ from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
 from types import NoneType
-from typing import Any, ClassVar, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from agents.utils.loggers import LOGGERS
-from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.errors import Checked, Count, InvalidInputError, Natural, OneOf, Positive, Seed, unknown_name
 from scene_envs.registry import load_plugins, plugin_entry_points
 
 Config = TypeVar("Config")
@@ -35,43 +35,6 @@ _WANTED: dict[Any, str] = {
 }
 PROGRESS_STYLES = ("bar", "lines", "none")
 """How progress is shown, as in :data:`scene_envs.progress.STYLES`."""
-
-
-# Checks of single values
-
-
-def require_at_least(settings: Any, low: float, *names: str) -> None:
-    """Refuse numbers below ``low``, and NaN; None is accepted."""
-    for name in names:
-        if getattr(settings, name) is not None and not getattr(settings, name) >= low:
-            raise InvalidInputError(f"{name}={getattr(settings, name)} must be at least {low}")
-
-
-def require_positive(settings: Any, *names: str) -> None:
-    """Refuse numbers that are not positive."""
-    for name in names:
-        if not getattr(settings, name) > 0:
-            raise InvalidInputError(f"{name}={getattr(settings, name)} must be positive")
-
-
-def require_finite(settings: Any, *names: str) -> None:
-    """Refuse infinite numbers and NaN."""
-    for name in names:
-        if not math.isfinite(getattr(settings, name)):
-            raise InvalidInputError(f"{name}={getattr(settings, name)} must be a finite number")
-
-
-def require_unit_interval(settings: Any, *names: str) -> None:
-    """Refuse numbers outside 0 to 1."""
-    for name in names:
-        if not 0 <= getattr(settings, name) <= 1:
-            raise InvalidInputError(f"{name}={getattr(settings, name)} is outside 0..1: it is a share")
-
-
-def require_one_of(settings: Any, name: str, known: Sequence[str], what: str = "") -> None:
-    """Refuse a word that is not in ``known``; the message calls it ``what`` and offers the nearest known word."""
-    if getattr(settings, name) not in known:
-        raise unknown_name(what or name, str(getattr(settings, name)), known)
 
 
 def check_types(kind: type, values: Mapping[str, Any]) -> None:
@@ -103,9 +66,12 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
         UnknownNameError: a key that ``kind`` does not have; the nearest one is offered.
         InvalidInputError: a value is not of the type of its key.
     """
-    made, init = object.__new__(kind), kind.__init__  # type: ignore[misc]
-    getattr(init, "__wrapped__", init)(made, **field_values(kind, tree, path, command))  # composed() composes again
-    return made
+    defaults = {
+        field.name: field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+        for field in dataclasses.fields(kind)  # type: ignore[arg-type]
+    }
+    values = defaults | field_values(kind, tree, path, command)
+    return kind(**{name: value for name, value in values.items() if value is not dataclasses.MISSING})
 
 
 def field_values(kind: type, tree: Mapping[str, Any], path: str = "", command: str = "") -> dict[str, Any]:
@@ -471,8 +437,12 @@ MAX_GRADIENT_NORM = 1.0
 """Largest norm of a gradient in training; longer gradients are scaled down."""
 
 
+OPTIMIZERS = ("adamw",)
+"""Names of optimisers."""
+
+
 @dataclass
-class OptimizerSettings:
+class OptimizerSettings(Checked):
     """An optimiser of weights.
 
     Attributes:
@@ -480,19 +450,12 @@ class OptimizerSettings:
         lr: peak learning rate.
     """
 
-    KNOWN: ClassVar[Sequence[str]] = ("adamw",)
-    """Optimisers by name."""
-
-    name: str = "adamw"
-    lr: float = 1e-3
-
-    def __post_init__(self) -> None:
-        require_one_of(self, "name", self.KNOWN, "optimizer")
-        require_positive(self, "lr")
+    name: Annotated[str, OneOf(OPTIMIZERS, "optimizer")] = "adamw"
+    lr: Positive = 1e-3
 
 
 @dataclass
-class LoggerSettings:
+class LoggerSettings(Checked):
     """Files of a run, and how often they are written.
 
     Attributes:
@@ -501,16 +464,12 @@ class LoggerSettings:
         checkpoint_every: steps or iterations between resumable checkpoints.
     """
 
-    name: str = "csv"
-    checkpoint_every: int = 10
-
-    def __post_init__(self) -> None:
-        require_one_of(self, "name", LOGGERS, "logger")
-        require_at_least(self, 1, "checkpoint_every")
+    name: Annotated[str, OneOf(LOGGERS, "logger")] = "csv"
+    checkpoint_every: Count = 10
 
 
 @dataclass
-class DeviceKeys:
+class DeviceKeys(Checked):
     """Device of the networks.
 
     Attributes:
@@ -521,7 +480,7 @@ class DeviceKeys:
 
 
 @dataclass
-class PrecisionKeys:
+class PrecisionKeys(Checked):
     """Precision of the chains of a prior.
 
     Attributes:
@@ -533,18 +492,18 @@ class PrecisionKeys:
 
 
 @dataclass
-class ProgressKeys:
+class ProgressKeys(Checked):
     """Progress of the work.
 
     Attributes:
         progress: progress display: ``bar`` (lines where there is no terminal), ``lines`` or ``none``.
     """
 
-    progress: str = "bar"
+    progress: Annotated[str, OneOf(PROGRESS_STYLES)] = "bar"
 
 
 @dataclass
-class PromptKeys:
+class PromptKeys(Checked):
     """Prompt of the scenes.
 
     Attributes:
@@ -569,9 +528,9 @@ class SamplingKeys(PromptKeys):
         seed: seed of the noise.
     """
 
-    num_steps: int = 50
-    slots: int | None = None
-    seed: int = 0
+    num_steps: Count = 50
+    slots: Count | None = None
+    seed: Seed = 0
 
 
 @dataclass
@@ -585,13 +544,13 @@ class DrawKeys(PrecisionKeys, DeviceKeys):
         seed: seed of the noise.
     """
 
-    num_steps: int = 50
+    num_steps: Count = 50
     physics_guidance: float | None = None
-    seed: int = 0
+    seed: Seed = 0
 
 
 @dataclass
-class RewardLimits:
+class RewardLimits(Checked):
     """Limits of a reward from outside this package.
 
     Attributes:
@@ -599,17 +558,14 @@ class RewardLimits:
         memory: most memory that the reward may allocate, GiB.
     """
 
-    timeout: float = 60.0
-    memory: float = 1.0
+    timeout: Positive = 60.0
+    memory: Positive = 1.0
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 < value < math.inf:
-                raise InvalidInputError(f"reward_limits.{name}={value} must be a positive number")
+    place = "reward_limits."
 
 
 @dataclass
-class RewardLimitKeys:
+class RewardLimitKeys(Checked):
     """Rewards from outside this package.
 
     Attributes:
@@ -632,9 +588,9 @@ class OutputKeys(DeviceKeys):
     """
 
     output: str = ""
-    pictures: int = 12
-    batch_size: int = 64
-    workers: int = 2
+    pictures: Natural = 12
+    batch_size: Count = 64
+    workers: Natural = 2
     physics: str = "auto"
 
 

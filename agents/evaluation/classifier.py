@@ -10,9 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.configuration.composition import require_at_least
 from agents.evaluation.set_network import SetNetwork, TypicalPlaces, blurred, scene_tokens
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Checked, Count, InvalidInputError
 from scene_envs.scene import SceneBatch, check_same_assets
 
 MIN_SCENES = 20
@@ -56,7 +55,7 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
-class ClassifierConfig:
+class ClassifierConfig(Checked):
     """Settings of the training of a classifier.
 
     Attributes:
@@ -65,12 +64,9 @@ class ClassifierConfig:
         batch_size: number of scenes per step.
     """
 
-    epochs: int = 8
-    patience: int = 3
-    batch_size: int = 64
-
-    def __post_init__(self) -> None:
-        require_at_least(self, 1, "epochs", "patience", "batch_size")
+    epochs: Count = 8
+    patience: Count = 3
+    batch_size: Count = 64
 
 
 @dataclass(frozen=True)

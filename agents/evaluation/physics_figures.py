@@ -72,7 +72,7 @@ def ready_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[st
 
     result = make_ready(batch, pool=pool)
     figures = {"ready_invalid_fraction": 1.0 - float(result.valid.double().mean())}
-    return {**figures, **_per_scene_and_fraction("ready", batch, result.counts, result.valid)}
+    return {**figures, **per_scene_and_fraction("ready", batch, result.counts, result.valid)}
 
 
 def stability_figures(batch: SceneBatch, pool: PhysicsPool | None = None) -> dict[str, float]:
@@ -153,10 +153,10 @@ def _feasibility(batch: SceneBatch, pool: PhysicsPool | None) -> dict[str, float
     figures = {"invalid_fraction": 1.0 - float(result.valid.double().mean())}
     with contextlib.suppress(InvalidInputError):
         figures["stable_fraction"] = stable_fraction(batch, pool=pool)
-    return {**figures, **_per_scene_and_fraction("feasible", batch, result.counts, result.valid)}
+    return {**figures, **per_scene_and_fraction("feasible", batch, result.counts, result.valid)}
 
 
-def _per_scene_and_fraction(name: str, batch: SceneBatch, counts: Tensor, valid: Tensor) -> dict[str, float]:
+def per_scene_and_fraction(name: str, batch: SceneBatch, counts: Tensor, valid: Tensor) -> dict[str, float]:
     """Mean of ``counts`` (B,) over valid scenes, and their sum as a share of the free objects there."""
     figures = {}
     if bool(valid.any()):

@@ -17,11 +17,10 @@ from agents.planning.ledger import (
     Searchable,
     SearchBudget,
     best_different,
-    check_at_least,
     register_planner,
     state_value,
 )
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Count, Natural, Share
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -49,16 +48,10 @@ class EvolutionPlanner(PlannerSettings):
 
     name: str = "evolution"
     widens = True
-    population: int = 8
-    children: int | None = None
-    crossover: float = 0.5
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_at_least(self, 1, "population", "children")
-        check_at_least(self, 0, "crossover", "seed")
-        if self.crossover > 1:
-            raise InvalidInputError(f"planner {self.name}: crossover={self.crossover} is a probability, in 0..1")
+    population: Count = 8
+    children: Count | None = None
+    crossover: Share = 0.5
+    seed: Natural = 0
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state; without ``with_scene`` there are no splices."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -14,11 +14,10 @@ from agents.planning.ledger import (
     Progress,
     Searchable,
     SteeredProblem,
-    check_at_least,
     register_planner,
 )
 from agents.planning.simple import GreedyPlanner
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import BELOW_ONE, Count, at_least
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -105,16 +104,10 @@ class FeynmanKacPlanner(PlannerSettings):
     name: str = "feynman_kac"
     widens = True
     steers = True
-    particles: int = 8
-    resamplings: int = 2
-    begin: float = 0.7
-    strength: float = 50.0
-
-    def __post_init__(self) -> None:
-        check_at_least(self, 1, "particles", "resamplings")
-        check_at_least(self, 0, "begin", "strength")
-        if self.begin >= 1:
-            raise InvalidInputError(f"planner {self.name}: begin={self.begin} is a share of the steps, below 1")
+    particles: Count = 8
+    resamplings: Count = 2
+    begin: Annotated[float, BELOW_ONE] = 0.7
+    strength: Annotated[float, at_least(0)] = 50.0
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state.

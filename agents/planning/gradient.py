@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from agents.configuration.composition import build
 from agents.planning.ledger import (
@@ -13,12 +13,11 @@ from agents.planning.ledger import (
     Progress,
     Searchable,
     SteeredProblem,
-    check_at_least,
     list_planners,
     planner_settings,
     register_planner,
 )
-from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.errors import BELOW_ONE, Count, InvalidInputError, at_least, unknown_name
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,15 +51,12 @@ class GradientPlanner(PlannerSettings):
     steers = True
     planner: Any = "greedy"
     weight: Any = "overlap"
-    strength: float = 1.0
-    begin: float = 0.5
-    children: int | None = None
+    strength: Annotated[float, at_least(0)] = 1.0
+    begin: Annotated[float, BELOW_ONE] = 0.5
+    children: Count | None = None
 
     def __post_init__(self) -> None:
-        check_at_least(self, 0, "strength", "begin")
-        check_at_least(self, 1, "children")
-        if self.begin >= 1:
-            raise InvalidInputError(f"planner {self.name}: begin={self.begin} is a share of the steps, below 1")
+        super().__post_init__()
         if not callable(self.weight) and self.weight not in WEIGHTS:
             raise unknown_name("differentiable weight", str(self.weight), WEIGHTS)
         self._guided()

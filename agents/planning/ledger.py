@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
-from scene_envs.errors import InvalidInputError, SceneEnvsError
+from scene_envs.errors import Checked, InvalidInputError, SceneEnvsError
 from scene_envs.registry import Registry
 
 Progress = Callable[[int, float], None]
@@ -210,7 +210,7 @@ PER_STATE = ("children", "parallel")
 
 
 @dataclass(frozen=True)
-class PlannerSettings:
+class PlannerSettings(Checked):
     """A planner by name, and its keys.
 
     Attributes:
@@ -223,6 +223,11 @@ class PlannerSettings:
     actions as the budget."""
     steers: ClassVar[bool] = False
     """Whether the planner itself steers the denoising."""
+
+    @property
+    def place(self) -> str:  # type: ignore[override]
+        """What stands in front of the name of a key in messages."""
+        return f"planner {self.name}: "
 
     def make(self, branching: int) -> Any:
         """The planner: an object with ``plan(problem, budget, progress)``, as :class:`agents.planning.GreedyPlanner`.
@@ -257,11 +262,3 @@ def list_planners() -> list[str]:
 def planner_settings(name: str) -> type[PlannerSettings]:
     """The dataclass of a planner's keys; an UnknownNameError offers the nearest known name."""
     return _PLANNERS[name]
-
-
-def check_at_least(planner: PlannerSettings, minimum: float, *names: str) -> None:
-    """Raise InvalidInputError if a key is below ``minimum`` or not finite; keys that are None are left to ``make``."""
-    for name in names:
-        value = getattr(planner, name)
-        if value is not None and not (minimum <= value < float("inf")):
-            raise InvalidInputError(f"planner {planner.name}: {name} must be a number >= {minimum:g}, got {value}")

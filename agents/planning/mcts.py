@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 from agents.planning.ledger import (
     Candidate,
@@ -12,13 +13,10 @@ from agents.planning.ledger import (
     Progress,
     Searchable,
     SearchBudget,
-    check_at_least,
     register_planner,
     state_value,
 )
-from scene_envs.errors import unknown_name
-
-ROLLOUTS = ("random", "all")
+from scene_envs.errors import Count, Natural, OneOf, at_least
 
 
 @dataclass(eq=False)
@@ -51,16 +49,10 @@ class MCTSPlanner(PlannerSettings):
 
     name: str = "mcts"
     widens = True
-    exploration: float = 0.1
-    children: int | None = None
-    rollout: str = "all"
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_at_least(self, 0, "exploration", "seed")
-        check_at_least(self, 1, "children")
-        if self.rollout not in ROLLOUTS:
-            raise unknown_name("rollout", str(self.rollout), ROLLOUTS)
+    exploration: Annotated[float, at_least(0)] = 0.1
+    children: Count | None = None
+    rollout: Annotated[str, OneOf(("random", "all"))] = "all"
+    seed: Natural = 0
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the problem's current state."""

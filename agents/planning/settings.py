@@ -12,11 +12,10 @@ from agents.configuration.composition import (
     composed,
     named,
     nested,
-    require_at_least,
 )
 from agents.planning.gradient import GradientPlanner
 from agents.planning.ledger import PlannerSettings, list_planners, planner_settings
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Count, InvalidInputError, Natural, Positive
 
 
 @dataclass
@@ -25,9 +24,9 @@ class BudgetKeys:
 
     budget: int = 64
     max_nfe: int | None = None
-    max_seconds: float | None = None
-    count: int | None = None
-    side_by_side: int = 16
+    max_seconds: Positive | None = None
+    count: Count | None = None
+    side_by_side: Count = 16
     baseline: bool = True
 
 
@@ -70,13 +69,13 @@ class SearchConfig(BudgetKeys, SamplingKeys, PrecisionKeys, DeviceKeys):
         planner: the planner, which chooses the scenes to inpaint.
     """
 
-    branching: int = 4
+    branching: Count = 4
     max_depth: int = 1000
     mask: Any = named("blamed_or_empty", "mask")
     masks: list[Any] | None = None
     objective_scale: float | None = None
     physics_guidance: float = 0.0
-    workers: int = 0
+    workers: Natural = 0
     physics: str = "auto"
     planner: PlannerSettings = nested(
         GradientPlanner, folder="planner", option="gradient", kinds=planner_settings, registered=list_planners
@@ -100,9 +99,7 @@ class SearchConfig(BudgetKeys, SamplingKeys, PrecisionKeys, DeviceKeys):
         return [range(start, min(start + self.side_by_side, count)) for start in starts]
 
     def __post_init__(self) -> None:
-        require_at_least(self, 1, "branching", "count", "side_by_side", "num_steps")
-        if self.max_seconds is not None and not self.max_seconds > 0:
-            raise InvalidInputError(f"max_seconds={self.max_seconds} must be more than 0, or null for no limit")
+        super().__post_init__()
         if self.budget < self.branching:
             raise InvalidInputError(
                 f"budget={self.budget} scenes do not cover the {self.branching} first samples (branching); raise it"

@@ -14,9 +14,9 @@ from agents.planning.ledger import (
     Searchable,
     SearchBudget,
     best_different,
-    check_at_least,
     register_planner,
 )
+from scene_envs.errors import Count
 
 
 @register_planner("best_of")
@@ -33,10 +33,7 @@ class BestOfPlanner(PlannerSettings):
 
     name: str = "best_of"
     widens = True
-    parallel: int = 16
-
-    def __post_init__(self) -> None:
-        check_at_least(self, 1, "parallel")
+    parallel: Count = 16
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions, or as many as the root has actions."""
@@ -63,11 +60,8 @@ class BeamPlanner(PlannerSettings):
 
     name: str = "beam"
     widens = True
-    width: int = 3
-    children: int | None = None
-
-    def __post_init__(self) -> None:
-        check_at_least(self, 1, "width", "children")
+    width: Count = 3
+    children: Count | None = None
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state."""
@@ -96,10 +90,7 @@ class GreedyPlanner(PlannerSettings):
 
     name: str = "greedy"
     widens = True
-    children: int | None = None
-
-    def __post_init__(self) -> None:
-        check_at_least(self, 1, "children")
+    children: Count | None = None
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions below the current state."""

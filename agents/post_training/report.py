@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
-from agents.evaluation.physics_figures import leaving_out
+from agents.evaluation.physics_figures import leaving_out, per_scene_and_fraction
 from agents.post_training.guard import realism
 from agents.post_training.rollouts import PromptDeck, run_prompts, stream_seed
 from agents.post_training.run_files import (
@@ -193,14 +193,13 @@ def measure_prior(
     ready: ReadyResult | None = None
     scored: RewardOutput | None = None
     counts = raw.counts.double()
-    free = raw.is_free.sum(dim=-1).double()
     judged: dict[str, float] = {}
     with leaving_out("feasible", left_out):
         feasible = feasibility(raw, pool=pool)
         ready = make_ready(raw, pool=pool)
         judged = {
-            **_counted("feasible", feasible.counts, feasible.valid, free),
-            **_counted("ready", ready.counts, ready.valid, free),
+            **_counted("feasible", raw, feasible.counts, feasible.valid),
+            **_counted("ready", raw, ready.counts, ready.valid),
             "invalid_scenes": float((~(feasible.valid & ready.valid)).sum()),
         }
     context = RewardContext(None if prompts is None else tuple(prompts), pool)
@@ -222,17 +221,10 @@ def measure_prior(
     return Measured(figures, raw, ready.batch, ready.ready, left_out)
 
 
-def _counted(name: str, counts: Tensor, valid: Tensor, free: Tensor) -> dict[str, float]:
+def _counted(name: str, batch: SceneBatch, counts: Tensor, valid: Tensor) -> dict[str, float]:
     """Mean and standard error of ``counts`` over valid scenes, and their share of the free objects there."""
-    if not bool(valid.any()):
-        return {}
-    taken = counts[valid].double()
-    share = float(taken.sum() / free[valid].sum()) if float(free[valid].sum()) else 0.0
-    return {
-        f"{name}_objects": float(taken.mean()),
-        f"{name}_objects_sem": _standard_error(taken),
-        f"{name}_fraction": share,
-    }
+    figures = per_scene_and_fraction(name, batch, counts, valid)
+    return figures and {**figures, f"{name}_objects_sem": _standard_error(counts[valid].double())}
 
 
 def _mean(name: str, output: RewardOutput) -> dict[str, float]:

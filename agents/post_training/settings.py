@@ -7,9 +7,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from agents.configuration.composition import (
+    OPTIMIZERS,
     LoggerSettings,
     OptimizerSettings,
     ProgressKeys,
@@ -20,13 +21,10 @@ from agents.configuration.composition import (
     named,
     nested,
     plain_tree,
-    require_at_least,
-    require_one_of,
-    require_positive,
 )
 from agents.utils.loggers import LOGGERS
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance, check_guidance
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import BELOW_ONE, Checked, Count, InvalidInputError, Limit, Natural, OneOf, Positive, at_least
 from scene_envs.registry import Registry
 
 CREDITS = ("auto", "scene", "object")
@@ -34,7 +32,7 @@ CATEGORY_CREDITS = ("auto", "scene", "none")
 
 
 @dataclass
-class AlgorithmSettings:
+class AlgorithmSettings(Checked):
     """Settings that all algorithms share.
 
     Attributes:
@@ -50,10 +48,7 @@ class AlgorithmSettings:
     """Limits of the guard's figures of samples unless ``guard.limits`` names others."""
 
     name: str = ""
-    scenes_per_prompt: int = 8
-
-    def __post_init__(self) -> None:
-        require_at_least(self, 2, "scenes_per_prompt")
+    scenes_per_prompt: Annotated[int, at_least(2)] = 8
 
     @property
     def optimiser_steps(self) -> int:
@@ -75,15 +70,9 @@ class DDPOSFSettings(AlgorithmSettings):
     """
 
     name: str = "ddpo_sf"
-    gradient_steps: int = 8
-    min_std: float = 0.03
-    credit: str = "auto"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_at_least(self, 1, "gradient_steps")
-        require_positive(self, "min_std")
-        require_one_of(self, "credit", CREDITS)
+    gradient_steps: Count = 8
+    min_std: Positive = 0.03
+    credit: Annotated[str, OneOf(CREDITS)] = "auto"
 
 
 @dataclass
@@ -96,14 +85,8 @@ class DDPOISSettings(DDPOSFSettings):
     """
 
     name: str = "ddpo_is"
-    clip_epsilon: float = 1e-4
-    updates: int = 1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_at_least(self, 1, "updates")
-        if not 0 < self.clip_epsilon < 1:
-            raise InvalidInputError(f"clip_epsilon={self.clip_epsilon} must lie between 0 and 1")
+    clip_epsilon: Annotated[float, Limit(lambda value: 0 < value < 1, "must lie between 0 and 1")] = 1e-4
+    updates: Count = 1
 
 
 @dataclass
@@ -133,23 +116,13 @@ class ForwardProcessSettings(AlgorithmSettings):
         "classifier_accuracy": 0.1,
     }
 
-    updates: int = 2
-    draws: int = 2
-    credit: str = "auto"
-    category_credit: str = "auto"
-    sampler_decay: float = 0.9
-    advantage_clip: float = 2.0
-    expectation_lr: float = 3e-4
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_at_least(self, 1, "updates", "draws")
-        require_one_of(self, "credit", CREDITS)
-        require_one_of(self, "category_credit", CATEGORY_CREDITS)
-        require_positive(self, "advantage_clip")
-        require_at_least(self, 0, "expectation_lr")
-        if not 0 <= self.sampler_decay < 1:
-            raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
+    updates: Count = 2
+    draws: Count = 2
+    credit: Annotated[str, OneOf(CREDITS)] = "auto"
+    category_credit: Annotated[str, OneOf(CATEGORY_CREDITS)] = "auto"
+    sampler_decay: Annotated[float, BELOW_ONE] = 0.9
+    advantage_clip: Positive = 2.0
+    expectation_lr: Annotated[float, at_least(0)] = 3e-4
 
 
 @dataclass
@@ -161,11 +134,7 @@ class NFTSettings(ForwardProcessSettings):
     """
 
     name: str = "nft"
-    beta: float = 0.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive(self, "beta")
+    beta: Positive = 0.5
 
 
 @dataclass
@@ -177,12 +146,9 @@ class AWMSettings(ForwardProcessSettings):
     """
 
     name: str = "awm"
-    beta: float = 2.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.beta > 1:
-            raise InvalidInputError(f"beta={self.beta} must be above 1: below, a bad sample pushes without bound")
+    beta: Annotated[
+        float, Limit(lambda beta: beta > 1, "must be above 1: below, a bad sample pushes without bound")
+    ] = 2.0
 
 
 @dataclass
@@ -202,20 +168,11 @@ class GuidanceDistillationSettings(AlgorithmSettings):
     sample_limits: ClassVar[Mapping[str, float]] = ForwardProcessSettings.sample_limits
 
     name: str = "guidance_distillation"
-    updates: int = 4
-    draws: int = 2
-    strength: float = 1.0
-    clip: float = 1.0
-    sampler_decay: float = 0.9
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_at_least(self, 1, "updates", "draws")
-        require_positive(self, "strength", "clip")
-        if self.strength > 1:
-            raise InvalidInputError(f"strength={self.strength:g} must lie in (0, 1]; 1 learns the whole moves")
-        if not 0 <= self.sampler_decay < 1:
-            raise InvalidInputError(f"sampler_decay={self.sampler_decay} must lie in [0, 1)")
+    updates: Count = 4
+    draws: Count = 2
+    strength: Annotated[float, Limit(lambda value: 0 < value <= 1, "must lie in (0, 1]; 1 learns whole moves")] = 1.0
+    clip: Positive = 1.0
+    sampler_decay: Annotated[float, BELOW_ONE] = 0.9
 
 
 ENTRY_POINT_GROUP = "scene_envs.algorithms"
@@ -301,7 +258,7 @@ OBJECTIVES = ("pretraining", "discriminative")
 
 
 @dataclass
-class RegularisationSettings:
+class RegularisationSettings(Checked):
     """Settings of the regularisation: pretraining loss on real scenes.
 
     Attributes:
@@ -317,19 +274,18 @@ class RegularisationSettings:
             held-out scenes.
     """
 
-    objective: str = "pretraining"
-    weight: float | None = None
-    base_samples: int = 1024
+    place = "regularisation."
+
+    objective: Annotated[str, OneOf(OBJECTIVES)] = "pretraining"
+    weight: Annotated[float, at_least(0)] | None = None
+    base_samples: Count = 1024
     hold: str | None = None
-    batch_size: int = 48
+    batch_size: Count = 48
     scenes: str = "grammar"
     bank_size: int = 4096
 
     def __post_init__(self) -> None:
-        require_at_least(self, 1, "batch_size", "base_samples")
-        require_one_of(self, "objective", OBJECTIVES)
-        if self.weight is not None and not self.weight >= 0:
-            raise InvalidInputError(f"regularisation.weight={self.weight} must not be negative")
+        super().__post_init__()
         if self.target is not None and self.weight == 0:
             raise InvalidInputError(f"hold={self.hold} adjusts regularisation.weight, which is 0; give a weight")
 
@@ -352,13 +308,8 @@ class PostTrainOptimizerSettings(OptimizerSettings):
         chunk: scenes per forward and backward pass; null takes the whole batch at once.
     """
 
-    lr: float | None = None  # type: ignore[assignment]
-    chunk: int | None = None
-
-    def __post_init__(self) -> None:
-        require_at_least(self, 1, "chunk")
-        if self.lr is not None:
-            super().__post_init__()
+    lr: Positive | None = None  # type: ignore[assignment]
+    chunk: Count | None = None
 
 
 MIN_SAMPLES = 20
@@ -366,7 +317,7 @@ MIN_SAMPLES = 20
 
 
 @dataclass
-class GuardLimits:
+class GuardLimits(Checked):
     """Limits of figures of samples; null takes the default of the algorithm.
 
     Attributes:
@@ -377,17 +328,14 @@ class GuardLimits:
         classifier: the same for the accuracy of a classifier that tells samples from real scenes.
     """
 
-    count: float | None = None
-    stack: float | None = None
-    category: float | None = None
-    classifier: float | None = None
-
-    def __post_init__(self) -> None:
-        require_at_least(self, 0, "count", "stack", "category", "classifier")
+    count: Annotated[float, at_least(0)] | None = None
+    stack: Annotated[float, at_least(0)] | None = None
+    category: Annotated[float, at_least(0)] | None = None
+    classifier: Annotated[float, at_least(0)] | None = None
 
 
 @dataclass
-class GuardSettings:
+class GuardSettings(Checked):
     """Settings of the guard.
 
     Attributes:
@@ -402,19 +350,13 @@ class GuardSettings:
         limits: limits of the figures of samples.
     """
 
-    every: int = 5
-    scenes: int = 256
-    limit: float = 1.5
-    action: str = "report"
-    samples: int = 128
-    samples_every: int = 20
+    every: Count = 5
+    scenes: Count = 256
+    limit: Positive = 1.5
+    action: Annotated[str, OneOf(("report", "stop", "rollback"))] = "report"
+    samples: Natural = 128
+    samples_every: Count = 20
     limits: GuardLimits = nested(GuardLimits)
-
-    def __post_init__(self) -> None:
-        require_at_least(self, 1, "every", "scenes", "samples_every")
-        require_positive(self, "limit")
-        require_one_of(self, "action", ("report", "stop", "rollback"))
-        require_at_least(self, 0, "samples")
 
     @property
     def sampled(self) -> int:
@@ -442,12 +384,7 @@ class PostTrainLoggerSettings(LoggerSettings):
             report.
     """
 
-    report_scenes: int = 256
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.report_scenes < 0:
-            raise InvalidInputError(f"report_scenes={self.report_scenes} must not be negative; 0 writes no report")
+    report_scenes: Natural = 256
 
 
 @dataclass
@@ -457,8 +394,8 @@ class BatchKeys:
     :class:`PostTrainConfig` describes the keys.
     """
 
-    iterations: int = 60
-    batch_size: int = 48
+    iterations: Count = 60
+    batch_size: Annotated[int, at_least(2)] = 48
     workers: Any = 0
     physics: str = "auto"
 
@@ -509,12 +446,12 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
     prior: str = "dimsum_table"
     reward: Any = named("object_count", "reward")
     prompt: str | list[str] | None = None  # type: ignore[assignment]
-    num_steps: int = 25
+    num_steps: Count = 25
     algorithm: AlgorithmSettings = nested(
         DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
     )
     optimizer: PostTrainOptimizerSettings = nested(
-        PostTrainOptimizerSettings, folder="optimizer", option="adamw", registered=lambda: OptimizerSettings.KNOWN
+        PostTrainOptimizerSettings, folder="optimizer", option="adamw", registered=lambda: OPTIMIZERS
     )
     regularisation: RegularisationSettings = nested(RegularisationSettings)
     guard: GuardSettings = nested(GuardSettings)
@@ -523,9 +460,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
     )
 
     def __post_init__(self) -> None:
-        require_at_least(self, 1, "iterations", "num_steps", "slots")
-        require_at_least(self, 0, "seed")
-        require_at_least(self, 2, "batch_size")
+        super().__post_init__()
         if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
             raise InvalidInputError(
                 f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"

@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from agents.pretraining.settings import PretrainConfig, PretrainOptimizerSettings
-from scene_envs.errors import unknown_name
+from agents.pretraining.settings import PretrainConfig
 
 _BETAS = (0.9, 0.99)
 _MOMENTUM = 0.95
@@ -37,8 +36,6 @@ def build_optimizer(
     percent of the loss depend on prompts at first, and at the full rate all words get the same embedding before they
     are read.
     """
-    if name not in PretrainOptimizerSettings.KNOWN:
-        raise unknown_name("optimizer", name, PretrainOptimizerSettings.KNOWN)
     named = [(key, parameter) for key, parameter in network.named_parameters() if parameter.requires_grad]
     text = [p for key, p in named if key.startswith("text_encoder.")]
     matrices = [p for key, p in named if p.ndim == 2 and "blocks." in key and name == "muon"]

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any
 
 from agents.configuration.composition import (
     LoggerSettings,
@@ -16,19 +16,26 @@ from agents.configuration.composition import (
     composed,
     named,
     nested,
-    require_at_least,
-    require_finite,
-    require_one_of,
-    require_positive,
-    require_unit_interval,
 )
 from agents.utils.loggers import LOGGERS
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import (
+    BELOW_ONE,
+    FINITE,
+    Checked,
+    Count,
+    InvalidInputError,
+    Natural,
+    OneOf,
+    Positive,
+    Seed,
+    Share,
+    at_least,
+)
 from scene_envs.registry import plugin_entry_points
 
 
 @dataclass
-class ModuleSettings:
+class ModuleSettings(Checked):
     """Modules that are added to the core of the mixed flux network; other networks do not read them.
 
     Attributes:
@@ -46,16 +53,13 @@ class ModuleSettings:
     observed_flags: bool = True
     pooled_text: bool = True
     count_embedding: bool = True
-    relations: str = "axis"
+    relations: Annotated[str, OneOf(("axis", "largest", "none"))] = "axis"
     rotation_features: bool = True
     contacts: bool = True
 
-    def __post_init__(self) -> None:
-        require_one_of(self, "relations", ("axis", "largest", "none"))
-
 
 @dataclass
-class FluxSettings:
+class FluxSettings(Checked):
     """Details of the flux network; other networks do not read them.
 
     Attributes:
@@ -68,23 +72,18 @@ class FluxSettings:
             double-stream blocks, which is faster, or ``all``, as in the paper.
     """
 
-    frequencies: int = 8
-    double_blocks: int | None = None
-    embedding: int | None = None
-    pose_head: int = 64
-    time_scale: float = 1.0
-    text_reach: str = "double"
-
-    def __post_init__(self) -> None:
-        require_at_least(self, 0, "frequencies")
-        require_at_least(self, 1, "pose_head", "double_blocks", "embedding")
-        require_positive(self, "time_scale")
-        require_one_of(self, "text_reach", ("double", "all"), "reach of text")
+    frequencies: Natural = 8
+    double_blocks: Count | None = None
+    embedding: Count | None = None
+    pose_head: Count = 64
+    time_scale: Positive = 1.0
+    text_reach: Annotated[str, OneOf(("double", "all"), "reach of text")] = "double"
 
 
 NETWORKS = ("flux", "midiffusion", "diffuscene")
 """Networks of this package."""
 PROCESSES = ("mixed", "continuous")
+KERNELS = ("mask_and_replace", "absorbing", "early_absorbing", "squared_absorbing", "uniform")
 TEXT_ENCODERS = {
     "none": {"encoder": "none"},
     "vocabulary": {"encoder": "vocabulary"},
@@ -103,7 +102,7 @@ def registered_networks() -> Sequence[str]:
 
 
 @dataclass
-class NetworkSettings:
+class NetworkSettings(Checked):
     """The network of a fresh prior.
 
     Attributes:
@@ -116,18 +115,15 @@ class NetworkSettings:
     """
 
     name: str = "flux"
-    hidden: int = 128
-    depth: int = 6
-    heads: int = 4
+    hidden: Count = 128
+    depth: Count = 6
+    heads: Count = 4
     flux: FluxSettings = nested(FluxSettings)
     modules: ModuleSettings = nested(ModuleSettings)
 
-    def __post_init__(self) -> None:
-        require_at_least(self, 1, "hidden", "depth", "heads")
-
 
 @dataclass
-class NoiseRange:
+class NoiseRange(Checked):
     """Noise-to-signal ratios of a karras schedule.
 
     Attributes:
@@ -135,18 +131,17 @@ class NoiseRange:
         ceiling: the highest.
     """
 
-    floor: float = 0.002
-    ceiling: float = 20.0
+    floor: Positive = 0.002
+    ceiling: Positive = 20.0
 
     def __post_init__(self) -> None:
-        require_positive(self, "floor", "ceiling")
-        require_finite(self, "ceiling")
+        super().__post_init__()
         if not self.floor < self.ceiling:
             raise InvalidInputError(f"floor={self.floor} of the noise must be less than ceiling={self.ceiling}")
 
 
 @dataclass
-class ProcessSettings:
+class ProcessSettings(Checked):
     """The diffusion process, and what is made of the network's output.
 
     Attributes:
@@ -169,32 +164,20 @@ class ProcessSettings:
         denoised_clip: bound on denoised scenes during sampling, in normalised units; 0 for no bound.
     """
 
-    name: str = "mixed"
-    prediction: str = "edm"
-    schedule: str = "karras"
+    name: Annotated[str, OneOf(PROCESSES, "process")] = "mixed"
+    prediction: Annotated[str, OneOf(("edm", "epsilon", "x0", "v"))] = "edm"
+    schedule: Annotated[str, OneOf(("karras", "linear", "cosine"), "noise schedule")] = "karras"
     noise: NoiseRange = nested(NoiseRange)
-    moments: str = "category"
-    rotation: str = "matrix"
-    kernel: str = "early_absorbing"
-    empty_slots: str = "dropped"
-    unmasking: str = "systematic"
-    denoised_clip: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_one_of(self, "name", PROCESSES, "process")
-        require_one_of(self, "prediction", ("edm", "epsilon", "x0", "v"))
-        require_one_of(self, "schedule", ("karras", "linear", "cosine"), "noise schedule")
-        require_one_of(self, "moments", ("category", "feature", "scene"))
-        require_one_of(self, "rotation", ("matrix", "quaternion", "axis_angle"))
-        kernels = ("mask_and_replace", "absorbing", "early_absorbing", "squared_absorbing", "uniform")
-        require_one_of(self, "kernel", kernels, "categorical kernel")
-        require_one_of(self, "empty_slots", ("attended", "dropped"), "treatment of empty slots")
-        require_one_of(self, "unmasking", ("systematic", "even", "independent"))
-        require_at_least(self, 0, "denoised_clip")
+    moments: Annotated[str, OneOf(("category", "feature", "scene"))] = "category"
+    rotation: Annotated[str, OneOf(("matrix", "quaternion", "axis_angle"))] = "matrix"
+    kernel: Annotated[str, OneOf(KERNELS, "categorical kernel")] = "early_absorbing"
+    empty_slots: Annotated[str, OneOf(("attended", "dropped"), "treatment of empty slots")] = "dropped"
+    unmasking: Annotated[str, OneOf(("systematic", "even", "independent"))] = "systematic"
+    denoised_clip: Annotated[float, at_least(0)] = 0.0
 
 
 @dataclass
-class TrainingNoiseSettings:
+class TrainingNoiseSettings(Checked):
     """Distribution of ln(noise-to-signal ratio) over the training timesteps.
 
     Attributes:
@@ -203,16 +186,12 @@ class TrainingNoiseSettings:
         std: its standard deviation.
     """
 
-    mean: float = -1.8
-    std: float = 2.1
-
-    def __post_init__(self) -> None:
-        require_finite(self, "mean")
-        require_positive(self, "std")
+    mean: Annotated[float, FINITE] = -1.8
+    std: Positive = 2.1
 
 
 @dataclass
-class LossSettings:
+class LossSettings(Checked):
     """The pretraining loss.
 
     Attributes:
@@ -231,24 +210,17 @@ class LossSettings:
     """
 
     noise: TrainingNoiseSettings = nested(TrainingNoiseSettings)
-    timesteps: str = "lognormal"
-    weighting: str = "none"
-    translation_weight: float = 3.0
-    category: str = "cross_entropy"
-    category_weight: float = 2.0
-    observed_share: float = 0.3
-    open_empty_share: float = 0.5
-
-    def __post_init__(self) -> None:
-        require_one_of(self, "timesteps", ("lognormal", "uniform", "both"), "distribution of timesteps")
-        require_one_of(self, "weighting", ("none", "min_snr"), "loss weighting")
-        require_one_of(self, "category", ("cross_entropy", "bound"), "category loss")
-        require_at_least(self, 0, "translation_weight", "category_weight")
-        require_unit_interval(self, "observed_share", "open_empty_share")
+    timesteps: Annotated[str, OneOf(("lognormal", "uniform", "both"), "distribution of timesteps")] = "lognormal"
+    weighting: Annotated[str, OneOf(("none", "min_snr"), "loss weighting")] = "none"
+    translation_weight: Annotated[float, at_least(0)] = 3.0
+    category: Annotated[str, OneOf(("cross_entropy", "bound"), "category loss")] = "cross_entropy"
+    category_weight: Annotated[float, at_least(0)] = 2.0
+    observed_share: Share = 0.3
+    open_empty_share: Share = 0.5
 
 
 @dataclass
-class VocabularySettings:
+class VocabularySettings(Checked):
     """The small text encoder with a closed vocabulary, which is trained with the prior.
 
     Attributes:
@@ -266,22 +238,18 @@ class VocabularySettings:
             learned number by number.
     """
 
-    width: int = 128
-    depth: int = 2
-    latents: int = 16
-    window: int = 3
-    lr_share: float = 0.5
+    width: Count = 128
+    depth: Count = 2
+    latents: Count = 16
+    window: Count = 3
+    lr_share: Annotated[float, at_least(0)] = 0.5
     count_conditioning: bool = True
-    warmup: int = 400
+    warmup: Natural = 400
     numbers: bool = True
-
-    def __post_init__(self) -> None:
-        require_at_least(self, 1, "width", "depth", "latents", "window")
-        require_at_least(self, 0, "lr_share", "warmup")
 
 
 @dataclass
-class TextSettings:
+class TextSettings(Checked):
     """Text encoder of a mixed prior.
 
     Attributes:
@@ -293,10 +261,7 @@ class TextSettings:
 
     encoder: str = "none"
     vocabulary: VocabularySettings = nested(VocabularySettings)
-    dropout: float = 0.1
-
-    def __post_init__(self) -> None:
-        require_unit_interval(self, "dropout")
+    dropout: Share = 0.1
 
     @property
     def is_read(self) -> bool:
@@ -305,7 +270,7 @@ class TextSettings:
 
 
 @dataclass
-class RateSettings:
+class RateSettings(Checked):
     """Course of the learning rate.
 
     Attributes:
@@ -314,17 +279,13 @@ class RateSettings:
         decay: last share of the steps, in which it decays along a cosine; 1 decays from the warm-up on.
     """
 
-    warmup: int = 100
-    final: float = 0.01
-    decay: float = 0.3
-
-    def __post_init__(self) -> None:
-        require_at_least(self, 0, "warmup")
-        require_unit_interval(self, "final", "decay")
+    warmup: Natural = 100
+    final: Share = 0.01
+    decay: Share = 0.3
 
 
 @dataclass
-class ComputeSettings:
+class ComputeSettings(Checked):
     """How the steps are computed.
 
     Attributes:
@@ -334,17 +295,13 @@ class ComputeSettings:
         compile: compile the network with ``torch.compile`` (needs a C++ compiler on a CPU).
     """
 
-    accumulate: int = 1
-    precision: str = "float32"
-    matmul_precision: str = "highest"
+    accumulate: Count = 1
+    precision: Annotated[str, OneOf(("float32", "bfloat16"))] = "float32"
+    matmul_precision: Annotated[str, OneOf(("highest", "high", "medium"))] = "highest"
     compile: bool = False
 
-    def __post_init__(self) -> None:
-        require_at_least(self, 1, "accumulate")
-        require_one_of(self, "precision", ("float32", "bfloat16"))
-        require_one_of(self, "matmul_precision", ("highest", "high", "medium"))
 
-
+PRETRAIN_OPTIMIZERS = ("adamw", "muon")
 WEIGHT_DECAY = 0.01
 """Decoupled weight decay of pretraining."""
 
@@ -361,17 +318,10 @@ class PretrainOptimizerSettings(OptimizerSettings):
         compute: how the steps are computed.
     """
 
-    KNOWN: ClassVar[Sequence[str]] = ("adamw", "muon")
-
-    name: str = "muon"
-    ema: float = 0.999
+    name: Annotated[str, OneOf(PRETRAIN_OPTIMIZERS, "optimizer")] = "muon"
+    ema: Annotated[float, BELOW_ONE] = 0.999
     rate: RateSettings = nested(RateSettings)
     compute: ComputeSettings = nested(ComputeSettings)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 <= self.ema < 1:
-            raise InvalidInputError(f"ema={self.ema} must lie in [0, 1)")
 
 
 @dataclass
@@ -383,13 +333,9 @@ class PretrainLoggerSettings(LoggerSettings):
         evaluate_every: steps between evaluations on held-out scenes.
     """
 
-    checkpoint_every: int = 250
-    log_every: int = 20
-    evaluate_every: int = 250
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_at_least(self, 1, "log_every", "evaluate_every")
+    checkpoint_every: Count = 250
+    log_every: Count = 20
+    evaluate_every: Count = 250
 
 
 @dataclass
@@ -434,9 +380,9 @@ class PretrainConfig(SceneKeys, TrainingKeys, ProgressKeys):
     """
 
     prior: str = ""
-    iterations: int = 5000
-    batch_size: int = 128
-    seed: int = 0
+    iterations: Natural = 5000
+    batch_size: Count = 128
+    seed: Seed = 0
     network: NetworkSettings = nested(NetworkSettings, folder="network", option="flux", registered=registered_networks)
     process: ProcessSettings = nested(ProcessSettings, folder="process", option="mixed", registered=lambda: PROCESSES)
     loss: LossSettings = nested(LossSettings)
@@ -445,15 +391,11 @@ class PretrainConfig(SceneKeys, TrainingKeys, ProgressKeys):
         PretrainOptimizerSettings,
         folder="optimizer",
         option="muon",
-        registered=lambda: PretrainOptimizerSettings.KNOWN,
+        registered=lambda: PRETRAIN_OPTIMIZERS,
     )
     logger: PretrainLoggerSettings = nested(
         PretrainLoggerSettings, folder="logger", option="csv", registered=lambda: LOGGERS
     )
-
-    def __post_init__(self) -> None:
-        require_at_least(self, 1, "batch_size")
-        require_at_least(self, 0, "iterations")
 
     @property
     def directory(self) -> Path:

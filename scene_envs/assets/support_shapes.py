@@ -84,14 +84,14 @@ def _maps(asset: Asset) -> tuple[Array, Array, Mask, Array, Array]:
     low = low - margin
     x, y = (low[axis] + (np.arange(_GRID) + 0.5) * cell[axis] for axis in (0, 1))
     grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    top = np.max([_upper_side(part, grid) for part in asset.fine], axis=0)
+    top = np.max([upper_side(part, grid) for part in asset.fine], axis=0)
     reach = np.maximum(1, np.round(_WIDEN / cell)).astype(int)
     wide = grey_dilation(top, size=tuple(2 * reach + 1), mode="constant", cval=-np.inf)
     wide[[0, -1]], wide[:, [0, -1]] = -np.inf, -np.inf
     return top, wide, binary_fill_holes(np.isfinite(wide)), low, cell
 
 
-def _upper_side(part: ConvexPart, grid: Array) -> Array:
+def upper_side(part: ConvexPart, grid: Array) -> Array:
     """(G, G): height of a convex part above each point of ``grid`` (G, G, 2); -inf outside it."""
     corners = part.vertices[part.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

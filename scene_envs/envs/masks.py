@@ -5,14 +5,14 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from scene_envs.envs.scoring import Score, resolve_reward
-from scene_envs.errors import InvalidInputError, SceneEnvsError, unknown_name
+from scene_envs.errors import Checked, InvalidInputError, Limit, SceneEnvsError, unknown_name
 from scene_envs.registry import Registry, load_plugin
 from scene_envs.scene import SceneBatch
 
@@ -65,20 +65,16 @@ def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Te
     return mask
 
 
-def check_count(mask: str, key: str, value: Any) -> None:
-    """Refuse a number of slots that is neither None (all) nor a whole number of at least 0."""
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 0):
-        raise InvalidInputError(f"mask={mask}: {key}={value!r} must be a whole number of at least 0")
+_SOME = Limit(lambda number: type(number) is int and number >= 0, "must be a whole number of at least 0")
 
 
 @dataclass(frozen=True)
-class EmptyMask:
+class EmptyMask(Checked):
     """Empty slots, and no object: ``count`` of them at random, or all with None."""
 
-    count: int | None = None
+    count: Annotated[int, _SOME] | None = None
 
-    def __post_init__(self) -> None:
-        check_count("empty", "count", self.count)
+    place = "mask=empty: "
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         return _some(scene.is_empty[0], scene.tensor.shape[1] if self.count is None else self.count, rng)
@@ -123,7 +119,7 @@ class OffPromptMask:
 
 
 @dataclass(frozen=True)
-class CulpritsMask:
+class CulpritsMask(Checked):
     """A smallest set of objects whose replacement ends all overlaps, and a few empty slots.
 
     It is enough to replace one object of an overlapping pair, though the objective blames both. Objects with most
@@ -137,10 +133,11 @@ class CulpritsMask:
     by clamping therefore adds too many objects and spoils the observed ones.
     """
 
-    at_least: int = 4
+    at_least: Annotated[int, _SOME] = 4
 
-    def __post_init__(self) -> None:
-        check_count(type(self).__name__.removesuffix("Mask").lower(), "at_least", self.at_least)
+    @property
+    def place(self) -> str:  # type: ignore[override]
+        return f"mask={type(self).__name__.removesuffix('Mask').lower()}: "
 
     def __call__(self, scene: SceneBatch, score: Score, rng: np.random.Generator) -> Tensor:
         """(N,) bool, True where a slot is regenerated; ``rng`` breaks ties and draws slots."""

@@ -5,18 +5,19 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
-from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.errors import Checked, InvalidInputError, Limit, OneOf, Positive, shown
 from scene_envs.scene_types import SceneType
 
 ACTION_MODES = ("next_sample", "noise")
 PROMPT_SOURCES = ("data", "grammar")
 """Values of ``prompt`` that select descriptions of scenes; any other text is a prompt itself."""
 
-_MAX_SLOTS = 100_000
+_WHOLE = Limit(lambda number: type(number) is int and 1 <= number < 2**31, "must be a whole number of at least 1")
+_SLOTS = Limit(lambda number: type(number) is int and 1 <= number <= 10**5, "must be a whole number from 1 to 100,000")
 _MAX_NUMBER = 1e30
 MASKS = (
     "balanced", "blamed_or_empty", "culprits", "empty", "infeasible", "infeasible_or_empty", "off_prompt", "random",
@@ -28,7 +29,7 @@ Init = TypeVar("Init", bound=Callable[..., None])
 
 
 @dataclass(frozen=True, kw_only=True)
-class EnvSettings:
+class EnvSettings(Checked):
     """Settings of every environment, which the tables of arguments of the environments' classes describe.
 
     Raises:
@@ -37,8 +38,8 @@ class EnvSettings:
 
     scene: str | SceneType | None = None
     prior: Any = None
-    num_steps: int = 50
-    slots: int | None = None
+    num_steps: Annotated[int, _WHOLE] = 50
+    slots: Annotated[int, _SLOTS] | None = None
     workers: int | str = 0
     physics: str = "auto"
     device: str = "auto"
@@ -46,20 +47,8 @@ class EnvSettings:
     guidance: float = 0.0
 
     def __post_init__(self) -> None:
-        self._require_at_least_one("num_steps")
-        if self.slots is not None:
-            self._require_at_least_one("slots", _MAX_SLOTS)
+        super().__post_init__()
         check_guidance(self.prompt, self.guidance)
-
-    def _require_at_least_one(self, name: str, maximum: int = 2**31 - 1) -> None:
-        number = getattr(self, name)
-        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= maximum:
-            at_most = f" and at most {maximum:,}" if isinstance(number, int) and number > maximum else ""
-            raise InvalidInputError(f"{name}={_shown(number)} must be a whole number of at least 1{at_most}")
-
-    def _require_positive(self, name: str) -> None:
-        if not _is_finite(number := getattr(self, name)) or number <= 0:
-            raise InvalidInputError(f"{name}={_shown(number)} must be positive and finite")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,13 +60,10 @@ class DenoisingSettings(EnvSettings):
     """
 
     reward: Any = "object_count"
-    action_mode: str = "next_sample"
-    max_action: float = 10.0
+    action_mode: Annotated[str, OneOf(ACTION_MODES, "action mode")] = "next_sample"
+    max_action: Positive = 10.0
 
     def __post_init__(self) -> None:
-        if self.action_mode not in ACTION_MODES:
-            raise unknown_name("action mode", str(self.action_mode), ACTION_MODES)
-        self._require_positive("max_action")
         super().__post_init__()
         if self.guidance and self.action_mode != "noise":
             raise InvalidInputError(
@@ -95,23 +81,17 @@ class TreeSettings(EnvSettings):
     """
 
     objective: Any = "feasible_objects"
-    branching: int = 4
-    max_depth: int = 10
-    objective_scale: float | None = None
-    max_nfe: int | None = None
+    branching: Annotated[int, _WHOLE] = 4
+    max_depth: Annotated[int, _WHOLE] = 10
+    objective_scale: Positive | None = None
+    max_nfe: Annotated[int, _WHOLE] | None = None
     claim_guidance: float = 0.0
     physics_guidance: float = 0.0
 
     def __post_init__(self) -> None:
-        self._require_at_least_one("branching")
-        self._require_at_least_one("max_depth")
-        if self.max_nfe is not None:
-            self._require_at_least_one("max_nfe")
         super().__post_init__()
         check_claim_guidance(self.prompt, self.claim_guidance)
         check_physics_guidance(self.physics_guidance)
-        if self.objective_scale is not None:
-            self._require_positive("objective_scale")
         if self.prompt is not None and not isinstance(self.prompt, str):
             raise InvalidInputError(f"prompt={self.prompt!r}: a search follows one text, or None")
 
@@ -138,7 +118,7 @@ class SearchMaskSettings(TreeSettings):
 def check_guidance(prompt: Any, guidance: Any) -> None:
     """Refuse (InvalidInputError) guidance that is no finite number, or has no prompt; ``""`` is none."""
     if not _is_finite(guidance):
-        raise InvalidInputError(f"guidance={_shown(guidance)} must be a finite number; 0 follows the prompt as it is")
+        raise InvalidInputError(f"guidance={shown(guidance)} must be a finite number; 0 follows the prompt as it is")
     if guidance and not prompt:
         raise InvalidInputError(
             f"guidance={guidance:g} strengthens a prompt, and prompt={prompt!r} asks for none; "
@@ -150,7 +130,7 @@ def check_claim_guidance(prompt: Any, strength: Any) -> None:
     """Refuse (InvalidInputError) claim guidance that is no number of at least 0, or has no prompt; ``""`` is none."""
     if not _is_finite(strength) or strength < 0:
         raise InvalidInputError(
-            f"claim_guidance={_shown(strength)} must be a finite number of at least 0; 0 guides nothing"
+            f"claim_guidance={shown(strength)} must be a finite number of at least 0; 0 guides nothing"
         )
     if strength and not prompt:
         raise InvalidInputError(
@@ -163,7 +143,7 @@ def check_physics_guidance(strength: Any, scene_type: SceneType | None = None) -
     """Refuse (InvalidInputError) physics guidance that is no number from 0 to 1, or of assets without geometry."""
     if not _is_finite(strength) or not 0 <= strength <= 1:
         raise InvalidInputError(
-            f"physics_guidance={_shown(strength)} must be a number from 0 to 1; 0 guides nothing, and 1 moves objects "
+            f"physics_guidance={shown(strength)} must be a number from 0 to 1; 0 guides nothing, and 1 moves objects "
             "until they neither overlap nor float"
         )
     if strength and scene_type is not None and not scene_type.has_geometry:
@@ -179,11 +159,6 @@ def _is_finite(number: Any) -> bool:
         return False
     size: Any = abs(number)
     return bool(size <= _MAX_NUMBER)
-
-
-def _shown(value: Any) -> str:
-    """A value in a message, of bounded length; Python refuses to write integers of thousands of digits."""
-    return "a very large number" if isinstance(value, int) and abs(value) > _MAX_NUMBER else repr(value)[:200]
 
 
 def takes(settings: type[Any]) -> Callable[[Init], Init]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_envs.assets.base import Asset
+from scene_envs.assets.support_shapes import upper_side
 
 
 class PositionDistribution(Protocol):
@@ -138,7 +139,6 @@ class Yaw:
 
 CLEARANCE = 5e-4
 """Margin (m) by which the plan of an asset is larger than the asset, so that neighbours never touch."""
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -285,22 +285,8 @@ def top_of(asset: Asset) -> float:
 
 def carrying_height(asset: Asset) -> float:
     """z (m, asset frame) at which something in the middle of ``asset`` rests: a plate's base, the floor of a bowl."""
-    heights = [top for part in asset.fine if (top := _top_on_axis(part.vertices[part.faces])) is not None]
-    return _tidy(max(heights)) if heights else top_of(asset)
-
-
-def _top_on_axis(triangles: NDArray[np.float64]) -> float | None:
-    """Highest z at which a convex part (F, 3, 3) crosses the line x = y = 0; None when it does not."""
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    offsets = np.einsum("fi,fi->f", normals, triangles[:, 0])
-    slope = normals[:, 2]
-    scale = np.abs(normals).max()
-    level = np.abs(slope) <= 1e-9 * scale
-    if (offsets[level] < -_ROUNDING * scale).any():
-        return None
-    high = (offsets[slope > 1e-9 * scale] / slope[slope > 1e-9 * scale]).min()
-    low = (offsets[slope < -1e-9 * scale] / slope[slope < -1e-9 * scale]).max()
-    return float(high) if high >= low - _ROUNDING else None
+    height = max(float(upper_side(part, np.zeros((1, 1, 2)))[0, 0]) for part in asset.fine)
+    return _tidy(height) if height > -math.inf else top_of(asset)
 
 
 def _tidy(value: float) -> float:

@@ -59,7 +59,7 @@ class Collider:
         coarse = place(self.library, objects, "coarse")
         low, high = object_boxes(coarse)
         first, second = scene_pairs(objects)
-        near = _boxes_near(low, high, first, second, NEAR, objects.fixed[first] | objects.fixed[second])
+        near = boxes_near(low, high, first, second, NEAR, objects.fixed[first] | objects.fixed[second])
         first, second = first[near], second[near]
         contacts, pair = self._near_parts(objects, coarse, first, second, *part_pairs(coarse, first, second))
         order = np.lexsort((contacts.gap, pair))
@@ -112,7 +112,7 @@ class Collider:
     ) -> tuple[Contacts, Index]:
         """Contacts among the part pairs (``a``, ``b``) of object pairs, and the object pair of each."""
         fixed = (objects.fixed[first] | objects.fixed[second])[pair]
-        near = np.flatnonzero(_boxes_near(placed.low, placed.high, a, b, NEAR, fixed))
+        near = np.flatnonzero(boxes_near(placed.low, placed.high, a, b, NEAR, fixed))
         pair, a, b = pair[near], a[near], b[near]
         gap, direction = separations(self.library, placed.parts, a, b)
         part = placed.parts.part
@@ -125,7 +125,8 @@ def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, secon
     return (corners[first] * directions[second] + directions[first] * corners[second]).astype(np.float64)
 
 
-def _boxes_near(low: Array, high: Array, a: Index, b: Index, margin: float, fixed: Mask | None = None) -> Mask:
+def boxes_near(low: Array, high: Array, a: Index, b: Index, margin: float, fixed: Mask | None = None) -> Mask:
+    """(P,) whether boxes are at most ``margin`` m apart, and pairs of something ``fixed`` at most 6 cm in height."""
     height = margin if fixed is None else np.where(fixed, NEAR_FIXED, margin)
     near = (low[a, 0] <= high[b, 0] + margin) & (low[b, 0] <= high[a, 0] + margin)
     near &= (low[a, 1] <= high[b, 1] + margin) & (low[b, 1] <= high[a, 1] + margin)

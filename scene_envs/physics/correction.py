@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from scene_envs.assets.base import AssetLibrary
+from scene_envs.physics import projection
 from scene_envs.physics.parts import library_geometry, padded
-from scene_envs.physics.projection import CLEARANCE
 from scene_envs.scene import SceneBatch, hull_corners
 
 _WALL_OVERLAP = 5e-4
@@ -36,8 +36,6 @@ _MIN_SPREAD = 0.05
 """Smallest standard deviation along an axis, as a share of the largest one."""
 _LEVEL = (1.0, 1.0, 50.0)
 """Cost of moving furniture by a metre along each axis: vertical moves are avoided."""
-_REACH = 0.02
-"""Parts nearer than this (m) are kept apart although they do not overlap."""
 _HEAP = 2e7
 """Limit of products of corners and face directions in the near object pairs of a scene; a scene of more is a heap."""
 _SCENES = 512
@@ -45,23 +43,12 @@ _SCENES = 512
 _BLOCKS = {"cpu": 1 << 18}
 _BLOCK = 1 << 24
 """Products of corners and face directions computed together: on a CPU their arrays stay in the cache."""
-_DOWN, _UP, _BLOCKED = 3.0, 1.4, 20.0
-"""Cost factors of a way down out of a fixed object, of a vertical way of two free ones, and of one out of the
-workspace."""
-_STILL = 1e-7
-"""Subtracted from speeds, so that none is zero."""
 _SWEEPS = 4
 """Parts that an object may pass one after the other on its way out of another object."""
-_FAR = 10.0
-"""Length (m) of a way that has no end."""
-_SLACK = 300.0
-"""Cost of a metre of overlap relative to a metre of distance, squared in the objective."""
 _MET = 1e-6
 """A plane broken by less than this (m) is met."""
 _ROUNDS, _STEPS = 3, 100
 """Rounds of the least-distance problem, after each of which broken planes join it, and steps of each."""
-_OUTSIDE = 0.05
-"""Objects further than this (m) outside the workspace are not moved back inside."""
 _AXES = torch.tensor([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, 0, 1.0], [0, 0, -1.0]])
 _STACKED = 32
 """Objects on top of each other that come down together."""
@@ -462,7 +449,7 @@ def _apart(things: _Things, bounds: Tensor, cost: Tensor) -> Tensor:
     that separate near parts of other pairs, are the rows of a least-distance problem. ``cost`` (3,) is that of a metre
     along each axis of the world.
     """
-    first, second = things.near(_REACH, _REACH)
+    first, second = things.near(projection.REACH, projection.REACH)
     way = _ways_out(things, first, second, bounds, cost)
     touched = torch.zeros_like(things.fixed)
     rows = torch.nonzero(way.any(dim=0))[:, 0]
@@ -474,9 +461,9 @@ def _apart(things: _Things, bounds: Tensor, cost: Tensor) -> Tensor:
     free_end = torch.where(things.fixed[first], second, first)
     chosen |= (things.fixed[first] | things.fixed[second]) & (beside[free_end] > 0)
     rows = torch.nonzero(chosen)[:, 0]
-    parts = _Parts.near(things, first[rows], second[rows], _REACH, _REACH)
+    parts = _Parts.near(things, first[rows], second[rows], projection.REACH, projection.REACH)
     pair, gap, direction = parts.planes(things, _at(way, rows))
-    return _nearest(things, first[rows[pair]], second[rows[pair]], direction, CLEARANCE - gap, bounds, cost)
+    return _nearest(things, first[rows[pair]], second[rows[pair]], direction, projection.CLEARANCE - gap, bounds, cost)
 
 
 def _ways_out(things: _Things, first: Tensor, second: Tensor, bounds: Tensor, cost: Tensor) -> Tensor:
@@ -511,7 +498,7 @@ def _ways_out(things: _Things, first: Tensor, second: Tensor, bounds: Tensor, co
     enter, leave = gap.new_empty(2, len(directions), len(gap))
     for rows, gaps, normals in groups:
         some = _at(directions, parts.pair[rows])
-        speed = _dot(some[:, None].unbind(dim=2), normals.unbind(dim=1)).sub_(_STILL)  # (D, K, q)
+        speed = _dot(some[:, None].unbind(dim=2), normals.unbind(dim=1)).sub_(projection.STILL)  # (D, K, q)
         when, nearer = -gaps / speed, speed < 0
         enter[:, rows] = torch.where(nearer, when, -torch.inf).amax(dim=1)
         leave[:, rows] = when.masked_fill_(nearer, torch.inf).amin(dim=1)
@@ -520,10 +507,10 @@ def _ways_out(things: _Things, first: Tensor, second: Tensor, bounds: Tensor, co
     for _ in range(_SWEEPS):
         here = _at(length, parts.pair) + _MET
         length = length.scatter_reduce(1, pair, torch.where((enter < here) & (leave > here), leave, 0.0), "amax")
-    length = length.clamp(max=_FAR)
+    length = length.clamp(max=projection.FAR)
     price = _weights(things, (first, second), directions, length, bounds) * (directions * cost[:, None]).norm(dim=1)
     best = (length * price).argmin(dim=0)
-    way = _chosen(directions, best) * (length.gather(0, best[None]) + CLEARANCE)
+    way = _chosen(directions, best) * (length.gather(0, best[None]) + projection.CLEARANCE)
     return torch.where(deepest < -_DEEP, way, 0.0)
 
 
@@ -538,11 +525,12 @@ def _weights(
     is_first = ~fixed[first] & (fixed[second] | (place[2, first] > place[2, second]))
     motion = torch.where(is_first, -directions, directions)
     rise = motion[:, 2]
-    weight = torch.where(held & (rise < -0.7), _DOWN, 1.0) * torch.where(~held & (rise.abs() > 0.7), _UP, 1.0)
+    weight = torch.where(held & (rise < -0.7), projection.DOWN, 1.0)
+    weight = torch.where(~held & (rise.abs() > 0.7), projection.UP, weight)
     target = place[:, torch.where(is_first, first, second)] + motion * length[:, None]
     low, high = bounds[..., None]
     leaves = ((target < low) | (target > high)).any(dim=1)
-    return torch.where(leaves & (held | (rise > 0.7)), weight * _BLOCKED, weight)
+    return torch.where(leaves & (held | (rise > 0.7)), weight * projection.BLOCKED, weight)
 
 
 def _nearest(
@@ -562,7 +550,7 @@ def _nearest(
     low, high = bounds[..., None]
     loose = torch.ones_like(things.fixed)
     loose[first] = loose[second] = False
-    loose = loose | ((home < low - _OUTSIDE) | (home > high + _OUTSIDE)).any(dim=0)
+    loose = loose | ((home < low - projection.OUTSIDE) | (home > high + projection.OUTSIDE)).any(dim=0)
     low, high = (torch.where(loose, sign * torch.inf, (limit - home) * scale) for sign, limit in ((-1, low), (1, high)))
     # A plane along an axis between a fixed object and a free one limits the free one exactly.
     is_limit = (direction.abs().amax(dim=0) > 1.0 - _MET) & (things.fixed[first] | things.fixed[second])
@@ -590,8 +578,8 @@ def _solved(ends: Tensor, direction: Tensor, needed: Tensor, found: Tensor, limi
     """
     places, size = ends.expand(3, -1), direction.abs()
     planes = torch.zeros_like(limits[0]).scatter_add_(1, places, size) * (limits[0] < limits[1])
-    step = 1.0 / ((size * _at(planes, ends)).sum(dim=0).view(2, -1).sum(dim=0) + _SLACK**-2)
-    kept, target = 1.0 - step * _SLACK**-2, step * needed
+    step = 1.0 / ((size * _at(planes, ends)).sum(dim=0).view(2, -1).sum(dim=0) + projection.SLACK**-2)
+    kept, target = 1.0 - step * projection.SLACK**-2, step * needed
 
     def moved(multipliers: Tensor) -> Tensor:
         pull = direction * multipliers.repeat(2)

@@ -44,8 +44,7 @@ def separations(library: LibraryGeometry, placed: PlacedParts, first: Index, sec
     positive when a face plane separates the pair, and its direction (P, 3) in the world, from first to second. The true
     distance is at least ``gap``, the true depth at most ``-gap``.
     """
-    gap = np.empty(len(first))
-    direction = np.empty((len(first), 3))
+    gap, direction = np.empty(len(first)), np.empty((len(first), 3))
     for rows, a, b in _groups(library, placed, first, second):
         combinations = a.normals.shape[1] * b.vertices.shape[1] + b.normals.shape[1] * a.vertices.shape[1]
         step = max(1, _BLOCK // combinations)
@@ -53,8 +52,8 @@ def separations(library: LibraryGeometry, placed: PlacedParts, first: Index, sec
             some = rows[start : start + step]
             one, two = first[some], second[some]
             shift = placed.translation[two] - placed.translation[one]
-            gap_a, normal_a = _best_face_gap(*_faces_and_corners(library, placed, a, one, b, two), shift)
-            gap_b, normal_b = _best_face_gap(*_faces_and_corners(library, placed, b, two, a, one), -shift)
+            gap_a, normal_a = _best(*_face_gaps(library, placed, a, one, b, two, shift), placed.rotation[one])
+            gap_b, normal_b = _best(*_face_gaps(library, placed, b, two, a, one, -shift), placed.rotation[two])
             use_a = gap_a >= gap_b
             gap[some] = np.where(use_a, gap_a, gap_b)
             direction[some] = np.where(use_a[:, None], normal_a, -normal_b)
@@ -72,15 +71,6 @@ def _groups(
         yield np.flatnonzero(groups == group), library.tables[class_a], library.tables[class_b]
 
 
-def _faces_and_corners(
-    library: LibraryGeometry, placed: PlacedParts, table: PartTable, owner: Index, other_table: PartTable, other: Index
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Face normals, face offsets and rotation of the owners; corners and rotation of the other parts."""
-    row, other_row = library.row[placed.part[owner]], library.row[placed.part[other]]
-    own = table.normals[row], table.offsets[row], placed.rotation[owner]
-    return *own, other_table.vertices[other_row], placed.rotation[other]
-
-
 def grouped_gaps(
     library: LibraryGeometry, placed: PlacedParts, first: Index, second: Index, shift: Array
 ) -> Iterator[tuple[Index, Array, Array]]:
@@ -90,41 +80,38 @@ def grouped_gaps(
     """
     for rows, a, b in _groups(library, placed, first, second):
         one, two = first[rows], second[rows]
-        gap_a, normal_a = _face_gaps(*_faces_and_corners(library, placed, a, one, b, two), shift[rows])
-        gap_b, normal_b = _face_gaps(*_faces_and_corners(library, placed, b, two, a, one), -shift[rows])
+        gap_a, normal_a = _face_gaps(library, placed, a, one, b, two, shift[rows])
+        gap_b, normal_b = _face_gaps(library, placed, b, two, a, one, -shift[rows])
+        normal_a, normal_b = (
+            normal @ placed.rotation[side].swapaxes(1, 2) for normal, side in ((normal_a, one), (normal_b, two))
+        )
         yield rows, np.concatenate([gap_a, gap_b], axis=1), np.concatenate([normal_a, -normal_b], axis=1)
 
 
-def _best_face_gap(
-    normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
-) -> tuple[Array, Array]:
-    """Best face of the owner: (P,) gap and (P, 3) world normal; ``shift`` leads to the other part."""
-    inverse = other.swapaxes(-1, -2)
-    seen = normals @ times(inverse, rotation).swapaxes(1, 2)  # (P, K, 3) in the other's frame
-    away = apply(inverse, shift)
-    gaps = _lowest(seen, vertices) + _along(seen, away) - offsets
-    best = gaps.argmax(axis=1)
-    rows = np.arange(len(best))
-    return gaps[rows, best], apply(rotation, normals[rows, best])
-
-
 def _face_gaps(
-    normals: Array, offsets: Array, rotation: Array, vertices: Array, other: Array, shift: Array
+    library: LibraryGeometry,
+    placed: PlacedParts,
+    table: PartTable,
+    owner: Index,
+    other_table: PartTable,
+    other: Index,
+    shift: Array,
 ) -> tuple[Array, Array]:
-    """Every face of the owner: (P, K) gaps and (P, K, 3) world normals."""
-    world = normals @ rotation.swapaxes(1, 2)
-    return _lowest(world @ other, vertices) + _along(world, shift) - offsets, world
+    """Gaps (P, K) of every face of the owners to the other parts, and its normal (P, K, 3) in the frame of its asset;
+    ``shift`` (P, 3) leads to the other part.
+    """
+    row, inverse = library.row[placed.part[owner]], placed.rotation[other].swapaxes(-1, -2)
+    normals, vertices = table.normals[row], other_table.vertices[library.row[placed.part[other]]]
+    seen = normals @ times(inverse, placed.rotation[owner]).swapaxes(1, 2)  # (P, K, 3) in the other's frame
+    x, y, z = apply(inverse, shift).T[..., None]
+    away = seen[..., 0] * x + seen[..., 1] * y + seen[..., 2] * z
+    return (vertices @ seen.swapaxes(1, 2)).min(axis=1) + away - table.offsets[row], normals
 
 
-def _lowest(directions: Array, vertices: Array) -> Array:
-    """(P, K) m: least height of vertices (P, V, 3) along directions (P, K, 3) of the same frame."""
-    return (vertices @ directions.swapaxes(1, 2)).min(axis=1)  # type: ignore[no-any-return]
-
-
-def _along(directions: Array, vector: Array) -> Array:
-    """(P, K) m: components of vectors (P, 3) along directions (P, K, 3)."""
-    x, y, z = vector[:, None, 0], vector[:, None, 1], vector[:, None, 2]
-    return directions[..., 0] * x + directions[..., 1] * y + directions[..., 2] * z  # type: ignore[no-any-return]
+def _best(gaps: Array, normals: Array, rotation: Array) -> tuple[Array, Array]:
+    """The largest of gaps (P, K), and the direction (P, 3) of its normal (P, K, 3) after the rotation (P, 3, 3)."""
+    line, best = np.arange(len(gaps)), gaps.argmax(axis=1)
+    return gaps[line, best], apply(rotation, normals[line, best])
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from scipy.optimize import nnls
 from scipy.sparse import csr_array
 
 from scene_envs.arrays import Array, Index, Mask
-from scene_envs.physics.collision import Collider, corner_tests, scene_pairs
+from scene_envs.physics.collision import Collider, boxes_near, corner_tests, scene_pairs
 from scene_envs.physics.parts import LibraryGeometry, Rows
 from scene_envs.physics.placement import (
     Budget,
@@ -35,9 +35,9 @@ from scene_envs.physics.placement import (
 
 CLEARANCE = 2e-5
 """Gap (m) that planes ask for, so that rounding does not leave an overlap."""
-_REACH = 0.02
+REACH = 0.02
 """Objects nearer than this (m) are kept apart although they do not overlap."""
-_SLACK = 300.0
+SLACK = 300.0
 """Cost of a metre of overlap relative to a metre of distance, squared in the objective."""
 _MET = 1e-7
 """A plane broken by less than this (m) is met."""
@@ -53,23 +53,21 @@ _ROWS_SQUARED = 25.0
 """A least-distance problem costs the square of its number of rows, divided by this, in units of work."""
 _AROUND = 0.06
 """Parts further apart than this (m) are ignored when a translation is measured."""
-_OWN = 4
-"""Face directions tried per object pair from its deepest parts, and from its shallowest, besides the common ones."""
 _MAX_WALK_STEPS = 6
 """Largest number of steps of a walk; each step leaves one overlapping part."""
-_DOWN = 3.0
+STILL = 1e-7
+"""Subtracted from speeds, so that none is zero."""
+_MAX_SWEEPS = 24
+"""Parts that an object may pass one after the other on its way out of another object."""
+FAR = 10.0
+"""Length (m) of a way that has no end."""
+DOWN = 3.0
 """Cost factor of a translation down, out of a fixed object: an object that lies in a board belongs on it."""
-_UP = 1.4
+UP = 1.4
 """Cost factor of a vertical translation of two free objects: the lower one rests on something and cannot share it."""
-_BLOCKED = 20.0
+BLOCKED = 20.0
 """Cost factor of a translation that leaves the workspace or ends in a fixed object."""
-_REPEATED = 2.5
-"""Cost factor of a direction for each time that it was tried and did not help."""
-_SAME_DIRECTION = 0.7
-"""Cosine above which two directions count as the same."""
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
-Tried = dict[tuple[int, int], list[Array]]
-"""The directions tried for each object pair so far."""
 _HEAP = 3_000_000
 """A group of objects whose boxes meet may be a heap when it takes more corner tests than this."""
 _DEEP = 5e-3
@@ -103,7 +101,7 @@ _NEGLIGIBLE = 1e-8
 """Sum of squared distances moved (m^2) below which no refinement is made."""
 _INSIDE = 1e-5
 """Objects stay this far (m) inside the workspace, so that rounding does not take them out."""
-_OUTSIDE = 0.05
+OUTSIDE = 0.05
 """Objects further than this (m) outside the workspace are no part of the arrangement and are not moved back inside."""
 
 
@@ -152,7 +150,6 @@ def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -
     home, walls, budget = objects.translation, _walls(bounds), Budget(WORK)
     best, best_way = None, np.inf
     waited = refinements = 0
-    tried: Tried = {}
     current = replace(objects, translation=nearest(objects, home, walls, budget))
     for _ in range(_ROUNDS):
         first, second, measured = _measure(collider, current, budget)
@@ -168,42 +165,26 @@ def _search(collider: Collider, objects: Objects, bounds: tuple[Array, Array]) -
             refinements += 1
             if refinements > _REFINEMENTS or way < _NEGLIGIBLE or gain < _GAIN * way:
                 break
-        elif waited > _PATIENCE:
+        elif (
+            waited > _PATIENCE or best_way < np.inf
+        ):  # a refinement that overlaps: the last result without overlap is kept
             break
-        elif best_way < np.inf:
-            break  # a refinement led to another overlap: the last result without overlap is kept
         if budget.is_spent or corner_tests(collider.library, current, first, second).sum() > _OVERLAPPING:
             break
-        near = _near_pairs(collider, current)
-        translation = _round(collider, current, home, first, second, near, bounds, walls, tried, budget)
-        current = replace(current, translation=translation)
+        near_first, near_second = pairs = scene_pairs(current)
+        near = boxes_near(*object_boxes(place(collider.library, current, "coarse")), *pairs, REACH)
+        near_first, near_second = near_first[near], near_second[near]
+        extra = np.zeros((len(near_first), 3))
+        if len(first):
+            rows = np.searchsorted(near_first * len(home) + near_second, first * len(home) + second)
+            extra[rows] = _minimum_translations(collider, current, first, second, bounds, budget)
+        planes = _separating_planes("coarse", collider, current, near_first, near_second, extra, home, budget)
+        current = replace(current, translation=nearest(current, home, planes + walls, budget))
     assert best is not None
-    inside = _inside(best.translation, bounds)
-    return best if inside is best.translation else _measure(collider, replace(objects, translation=inside), budget)[2]
-
-
-def _round(
-    collider: Collider,
-    current: Objects,
-    home: Array,
-    first: Index,
-    second: Index,
-    near: tuple[Index, Index],
-    bounds: tuple[Array, Array],
-    walls: Planes,
-    tried: Tried,
-    budget: Budget,
-) -> Array:
-    """The next translations: they free overlapping pairs (``first``, ``second``) and keep other ``near`` ones apart."""
-    near_first, near_second = near
-    extra = np.zeros((len(near_first), 3))
-    if len(first):
-        count = len(current)
-        moves = _minimum_translations(collider, current, first, second, bounds, tried, budget)
-        place_of = np.searchsorted(near_first * count + near_second, first * count + second)
-        extra[place_of] = moves
-    planes = _separating_planes(collider, current, near_first, near_second, extra, home, budget)
-    return nearest(current, home, planes + walls, budget)
+    inside = np.clip(best.translation, *bounds)  # slack may have let some leave the workspace
+    if (np.abs(inside - best.translation) <= 0.9 * _INSIDE).all():
+        return best
+    return _measure(collider, replace(objects, translation=inside), budget)[2]
 
 
 def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Index, Index, Projection]:
@@ -220,14 +201,8 @@ def _measure(collider: Collider, objects: Objects, budget: Budget) -> tuple[Inde
 def _bounds(home: Array, objects: Objects, workspace: Corners) -> tuple[Array, Array]:
     """Lowest and highest translations (n, 3); infinite for fixed objects and for objects far outside."""
     low, high = np.array(workspace[0]), np.array(workspace[1])
-    loose = objects.fixed | ((home < low - _OUTSIDE) | (home > high + _OUTSIDE)).any(axis=1)
+    loose = objects.fixed | ((home < low - OUTSIDE) | (home > high + OUTSIDE)).any(axis=1)
     return np.where(loose[:, None], -np.inf, low + _INSIDE), np.where(loose[:, None], np.inf, high - _INSIDE)
-
-
-def _inside(translation: Array, bounds: tuple[Array, Array]) -> Array:
-    """The translations; if slack let some leave the workspace, they are put back."""
-    clipped = np.clip(translation, *bounds)
-    return clipped if (np.abs(clipped - translation) > 0.9 * _INSIDE).any() else translation
 
 
 def _walls(bounds: tuple[Array, Array]) -> Planes:
@@ -266,16 +241,15 @@ def heaps(collider: Collider, objects: Objects) -> Mask:
     return chosen
 
 
-def _near_pairs(collider: Collider, objects: Objects) -> tuple[Index, Index]:
-    """Object pairs of one scene whose boxes are within reach of each other: (P,), (P,)."""
-    low, high = object_boxes(place(collider.library, objects, "coarse"))
-    first, second = scene_pairs(objects)
-    near = ((low[first] <= high[second] + _REACH) & (low[second] <= high[first] + _REACH)).all(axis=1)
-    return first[near], second[near]
-
-
 def _separating_planes(
-    collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array, budget: Budget
+    level: Level,
+    collider: Collider,
+    objects: Objects,
+    first: Index,
+    second: Index,
+    extra: Array,
+    home: Array,
+    budget: Budget,
 ) -> Planes:
     """Planes that keep object pairs (P,) of one scene apart; ``budget`` is charged with one unit per plane.
 
@@ -283,26 +257,13 @@ def _separating_planes(
     of coarse parts where they are already apart, of fine ones elsewhere. ``extra`` (P, 3) m is added to the offset of
     each pair: the minimum translation of those that overlap.
     """
-    coarse, pair, apart = _planes_at("coarse", collider, objects, first, second, extra, home)
-    budget.spent += len(pair)
-    nested = np.unique(pair[~apart])
-    if not len(nested):
-        return coarse
-    fine, _, _ = _planes_at("fine", collider, objects, first[nested], second[nested], extra[nested], home)
-    budget.spent += len(fine.bound)
-    return coarse[~np.isin(pair, nested)] + fine
-
-
-def _planes_at(
-    level: Level, collider: Collider, objects: Objects, first: Index, second: Index, extra: Array, home: Array
-) -> tuple[Planes, Index, Mask]:
-    """A plane for each near pair of parts (Q,), its object pair (Q,), and whether the parts are apart (Q,)."""
     placed = place(collider.library, objects, level)
     pair, a, b = part_pairs(placed, first, second)
     move = extra[pair]
-    near = (placed.low[a] <= placed.high[b] + move + _REACH).all(axis=1)
-    near &= (placed.low[b] + move <= placed.high[a] + _REACH).all(axis=1)
+    near = (placed.low[a] <= placed.high[b] + move + REACH).all(axis=1)
+    near &= (placed.low[b] + move <= placed.high[a] + REACH).all(axis=1)
     pair, a, b = pair[near], a[near], b[near]
+    budget.spent += len(pair)
     offset = objects.translation[second] - objects.translation[first] + extra
     away = (home[second] - home[first] - offset)[pair]
     offset = offset[pair]
@@ -315,7 +276,12 @@ def _planes_at(
         line = np.arange(len(rows))
         direction[rows], best[rows] = normals[line, chosen], largest
         bound[rows] = np.einsum("qi,qi->q", direction[rows], offset[rows]) - gaps[line, chosen] + CLEARANCE
-    return Planes(first[pair], second[pair], direction, bound), pair, best >= -_APART
+    planes = Planes(first[pair], second[pair], direction, bound)
+    nested = np.unique(pair[best < -_APART])
+    if level == "fine" or not len(nested):
+        return planes
+    some = first[nested], second[nested], extra[nested]
+    return planes[~np.isin(pair, nested)] + _separating_planes("fine", collider, objects, *some, home, budget)
 
 
 def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget) -> Array:
@@ -345,7 +311,7 @@ def nearest(objects: Objects, home: Array, planes: Planes, budget: Budget) -> Ar
 
 
 def least_distance(matrix: Array, needed: Array, budget: Budget) -> Array:
-    """The shortest x with ``matrix @ x + s >= needed``, slack s costing ``_SLACK`` squared.
+    """The shortest x with ``matrix @ x + s >= needed``, slack s costing ``SLACK`` squared.
 
     Lawson and Hanson's least-distance programme (1974, ch. 23) through non-negative least squares on its dual. Most
     rows hold anyway, so a row joins only when a solution without it violates it. Problems of more than ``_EXACT`` rows,
@@ -366,7 +332,7 @@ def least_distance(matrix: Array, needed: Array, budget: Budget) -> Array:
 def _exact(matrix: Array, needed: Array) -> Array:
     """Solution with all rows, through non-negative least squares."""
     count, width = matrix.shape
-    system = np.vstack([matrix.T, np.eye(count) / _SLACK, needed])
+    system = np.vstack([matrix.T, np.eye(count) / SLACK, needed])
     target = np.zeros(len(system))
     target[-1] = 1.0
     try:
@@ -384,11 +350,11 @@ def _approximate(matrix: Array, needed: Array) -> Array:
     sparse = csr_array(matrix)
     transposed = csr_array(matrix.T)
     size = abs(sparse)
-    step = 1.0 / (float(size.sum(axis=0).max()) * float(size.sum(axis=1).max()) + _SLACK**-2)
+    step = 1.0 / (float(size.sum(axis=0).max()) * float(size.sum(axis=1).max()) + SLACK**-2)
     multipliers = ahead = np.zeros(len(needed))
     momentum = 1.0
     for _ in range(_MAX_SOLVER_STEPS):
-        slope = needed - sparse @ (transposed @ ahead) - ahead / _SLACK**2
+        slope = needed - sparse @ (transposed @ ahead) - ahead / SLACK**2
         new = np.maximum(ahead + step * slope, 0.0)
         if slope @ (new - multipliers) < 0:
             momentum = 1.0
@@ -399,73 +365,26 @@ def _approximate(matrix: Array, needed: Array) -> Array:
 
 
 def _minimum_translations(
-    collider: Collider,
-    objects: Objects,
-    first: Index,
-    second: Index,
-    bounds: tuple[Array, Array],
-    tried: Tried,
-    budget: Budget,
+    collider: Collider, objects: Objects, first: Index, second: Index, bounds: tuple[Array, Array], budget: Budget
 ) -> Array:
     """(P, 3) m: translations that free overlapping object pairs when they are added to the offsets of the pairs.
-    Directions ``tried`` in vain cost more, and those of the result join them. ``budget`` is charged with one unit
-    per pair of parts.
+    ``budget`` is charged with one unit per pair of parts.
     """
     placed = place(collider.library, objects, "fine")
     pair, a, b = part_pairs(placed, first, second)
-    near = ((placed.low[a] <= placed.high[b] + _AROUND) & (placed.low[b] <= placed.high[a] + _AROUND)).all(axis=1)
+    near = boxes_near(placed.low, placed.high, a, b, _AROUND)
     pair, a, b = pair[near], a[near], b[near]
     budget.spent += len(pair)
     offset = objects.translation[second] - objects.translation[first]
     groups = list(grouped_gaps(collider.library, placed.parts, a, b, offset[pair]))
-    walk = _walk(objects, first, second, pair, groups, bounds)
-    directions = _directions(len(first), pair, groups, offset, walk)
-    lengths = _lengths(len(first), pair, groups, directions)
-    costs = lengths * _weights(collider, objects, first, second, directions, lengths, bounds)
-    best = np.empty(len(first), dtype=np.int64)
-    for row, key in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-        before = tried.setdefault(key, [])
-        for old in before:
-            costs[row, directions[row] @ old > _SAME_DIRECTION] *= _REPEATED
-        best[row] = costs[row].argmin()
-        before.append(directions[row, best[row]])
+    directions = _directions(objects, first, second, pair, groups, bounds)
+    lengths = _lengths(pair, groups, directions)
+    best = (lengths * _weights(objects, first, second, directions, lengths, bounds)).argmin(axis=1)
     line = np.arange(len(first))
     return directions[line, best] * (lengths[line, best] + CLEARANCE)[:, None]  # type: ignore[no-any-return]
 
 
-def _directions(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], offset: Array, walk: Array) -> Array:
-    """(P, D, 3) directions to try: the axes, the level directions away from and toward the other object, face normals
-    of the overlapping parts, and the direction of ``walk``.
-    """
-    directions = np.zeros((count, 9 + 2 * _OWN, 3))
-    directions[:, :6] = _AXES
-    level = offset * np.array([1.0, 1.0, 0.0])
-    length = np.linalg.norm(level, axis=1, keepdims=True)
-    level = np.where(length > 1e-6, level / np.maximum(length, 1e-6), np.array([1.0, 0.0, 0.0]))
-    directions[:, 6], directions[:, 7] = level, -level
-    directions[:, 8:] = level[:, None]
-    rows = np.concatenate([group[0] for group in groups])
-    depth, direction = np.empty(len(rows)), np.empty((len(rows), 3))
-    start = 0
-    for _, gaps, normals in groups:
-        best = gaps.argmax(axis=1)
-        line = np.arange(len(best))
-        depth[start : start + len(best)], direction[start : start + len(best)] = -gaps[line, best], normals[line, best]
-        start += len(best)
-    inside = depth > 0
-    owner, depth, direction = pair[rows][inside], depth[inside], direction[inside]
-    # The deepest parts first, then the shallowest.
-    for base, order in ((8, np.lexsort((-depth, owner))), (8 + _OWN, np.lexsort((depth, owner)))):
-        _, leading, members = np.unique(owner[order], return_index=True, return_counts=True)
-        rank = np.arange(len(order)) - np.repeat(leading, members)
-        top = order[rank < _OWN]
-        directions[owner[top], base + rank[rank < _OWN]] = direction[top]
-    length = np.linalg.norm(walk, axis=1)
-    directions[length > 0, -1] = walk[length > 0] / length[length > 0, None]
-    return directions
-
-
-def _walk(
+def _directions(
     objects: Objects,
     first: Index,
     second: Index,
@@ -473,99 +392,84 @@ def _walk(
     groups: list[tuple[Index, Array, Array]],
     bounds: tuple[Array, Array],
 ) -> Array:
-    """(P, 3) m: sum of several steps, each out of the part that is then the deepest; leads out of corners. From fixed
-    objects, steps down and steps out of the workspace are avoided.
+    """(P, D, 3) directions to try: the axes, the level directions away from and toward the other object, face normals
+    of the deepest and of the shallowest overlap of parts, and the direction of a walk: the sum of several steps, each
+    out of the part that is then the deepest, which leads out of corners. From fixed objects, steps down and steps out
+    of the workspace are avoided.
     """
+    level = (objects.translation[second] - objects.translation[first]) * [1.0, 1.0, 0.0]
+    length = np.linalg.norm(level, axis=1, keepdims=True)
+    level = np.where(length > 1e-6, level / np.maximum(length, 1e-6), [1.0, 0.0, 0.0])
+    directions = np.stack([*np.broadcast_to(_AXES[:, None], (6, *level.shape)), level, -level, *[level] * 3], axis=1)
     free = np.where(objects.fixed[first], second, first)
     sign = np.where(objects.fixed[first], 1.0, -1.0)
     held = objects.fixed[first] | objects.fixed[second]
     walk = np.zeros((len(first), 3))
-    for _ in range(_MAX_WALK_STEPS):
-        depth, direction = np.zeros(len(pair)), np.zeros((len(pair), 3))
+    for step in range(_MAX_WALK_STEPS):
+        depth, normal = np.zeros(len(pair)), np.zeros((len(pair), 3))
         for rows, gaps, normals in groups:
             owner = pair[rows]
             now = gaps + np.einsum("qki,qi->qk", normals, walk[owner])
             cost = now.copy()
             q = np.flatnonzero(held[owner] & (now < 0).all(axis=1))
             if len(q):
-                step = normals[q] * sign[owner[q], None, None]
+                moved = normals[q] * sign[owner[q], None, None]
                 here = objects.translation[free[owner[q]]] + sign[owner[q], None] * walk[owner[q]]
-                there = here[:, None] - step * now[q][..., None]
+                there = here[:, None] - moved * now[q][..., None]
                 low, high = (bound[free[owner[q]]][:, None] for bound in bounds)
                 leaves = ((there < low) | (there > high)).any(axis=2)
-                cost[q] *= np.where(leaves, _BLOCKED, np.where(step[..., 2] < -0.7, _DOWN, 1.0))
+                cost[q] *= np.where(leaves, BLOCKED, np.where(moved[..., 2] < -0.7, DOWN, 1.0))
             best = cost.argmax(axis=1)
             line = np.arange(len(rows))
-            depth[rows], direction[rows] = -now[line, best], normals[line, best]
-        order = np.lexsort((-depth, pair))
-        owner, leading = np.unique(pair[order], return_index=True)
-        deepest = order[leading]
-        inside = depth[deepest] > 1e-7
-        if not inside.any():
+            depth[rows], normal[rows] = -now[line, best], normals[line, best]
+        inside = np.flatnonzero(depth > 1e-7)
+        order = inside[np.lexsort((-depth[inside], pair[inside]))]
+        owner, deepest, count = np.unique(pair[order], return_index=True, return_counts=True)
+        if not len(owner):
             break
-        walk[owner[inside]] += (direction[deepest] * (depth[deepest] + 1e-7)[:, None])[inside]
-    return walk
+        if not step:
+            directions[owner, -3], directions[owner, -2] = normal[order[deepest]], normal[order[deepest + count - 1]]
+        walk[owner] += normal[order[deepest]] * (depth[order[deepest]] + 1e-7)[:, None]
+    length = np.linalg.norm(walk, axis=1)
+    directions[length > 0, -1] = walk[length > 0] / length[length > 0, None]
+    return directions
 
 
-def _lengths(count: int, pair: Index, groups: list[tuple[Index, Array, Array]], directions: Array) -> Array:
+def _lengths(pair: Index, groups: list[tuple[Index, Array, Array]], directions: Array) -> Array:
     """(P, D) m: length of the move in each direction until no parts overlap."""
-    enter = np.full((len(pair), directions.shape[1]), np.inf)
-    leave = np.full_like(enter, -np.inf)
+    enter = np.empty((len(pair), directions.shape[1]))
+    leave = np.empty_like(enter)
     for rows, gaps, normals in groups:
-        speed = np.einsum("qki,qdi->qkd", normals, directions[pair[rows]])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            when = -gaps[..., None] / speed
-        never = ((np.abs(speed) < 1e-9) & (gaps[..., None] >= 0)).any(axis=1)
-        enter[rows] = np.where(speed < -1e-9, when, -np.inf).max(axis=1)
-        leave[rows] = np.where(speed > 1e-9, when, np.inf).min(axis=1)
-        enter[rows] = np.where(never, np.inf, enter[rows])
-    order = np.argsort(pair, kind="stable")
-    enter, leave, owner = enter[order], leave[order], pair[order]
-    present, starts = np.unique(owner, return_index=True)
-    length = np.zeros((count, directions.shape[1]))
-    for _ in range(24):
-        here = length[owner]
-        inside = (enter < here + 1e-7) & (leave > here + 1e-7)
-        further = np.where(inside, leave, 0.0)
-        new = np.maximum(length[present], np.maximum.reduceat(further, starts, axis=0))
-        if (new <= length[present] + 1e-9).all():
+        speed = directions[pair[rows]] @ normals.swapaxes(1, 2) - STILL  # (Q, D, K)
+        when = -gaps[:, None] / speed
+        enter[rows] = np.where(speed < 0, when, -np.inf).max(axis=2)
+        leave[rows] = np.where(speed < 0, np.inf, when).min(axis=2)
+    length = np.zeros(directions.shape[:2])
+    for _ in range(_MAX_SWEEPS):
+        here = length[pair] + STILL
+        further = (enter < here) & (leave > here)
+        if not further.any():
             break
-        length[present] = new
-    return np.where(np.isfinite(length), length, 10.0)
+        row, column = np.nonzero(further)
+        np.maximum.at(length, (pair[row], column), leave[further])
+    return np.minimum(length, FAR)
 
 
 def _weights(
-    collider: Collider,
-    objects: Objects,
-    first: Index,
-    second: Index,
-    directions: Array,
-    lengths: Array,
-    bounds: tuple[Array, Array],
+    objects: Objects, first: Index, second: Index, directions: Array, lengths: Array, bounds: tuple[Array, Array]
 ) -> Array:
     """(P, D) cost factors of a metre in each direction."""
-    weight = np.ones(lengths.shape)
     fixed = objects.fixed[first] | objects.fixed[second]
     # The motion of the free object, or of the upper one of two.
     first_above = objects.fixed[second] | (objects.translation[first, 2] > objects.translation[second, 2])
     upper = np.where(~objects.fixed[first] & first_above, first, second)
     motion = np.where((upper == second)[:, None, None], directions, -directions)
-    weight[fixed[:, None] & (motion[..., 2] < -0.7)] *= _DOWN
-    weight[~fixed[:, None] & (np.abs(motion[..., 2]) > 0.7)] *= _UP
+    rise, held = motion[..., 2], fixed[:, None]
+    weight = np.where(held & (rise < -0.7), DOWN, 1.0) * np.where(~held & (np.abs(rise) > 0.7), UP, 1.0)
     target = objects.translation[upper][:, None] + motion * lengths[..., None]
-    low, high = bounds
-    leaves = ((target < low[upper][:, None] - 1e-6) | (target > high[upper][:, None] + 1e-6)).any(axis=2)
-    weight[leaves & (fixed[:, None] | (motion[..., 2] > 0.7))] *= _BLOCKED
-    if objects.fixed.any():
-        low, high = object_boxes(place(collider.library, objects, "coarse"))
-        boards = place(collider.library, objects[objects.fixed], "coarse")
-        rise = np.where(motion[..., 2] > 0.7, lengths, 0.0)  # (P, D)
-        above = (boards.low[None, :, :2] < high[upper][:, None, :2]).all(axis=2)
-        above &= (boards.high[None, :, :2] > low[upper][:, None, :2]).all(axis=2)
-        above &= boards.low[None, :, 2] > 0.5 * (low[upper] + high[upper])[:, None, 2]
-        room = np.where(above, boards.low[None, :, 2] - high[upper][:, None, 2], np.inf).min(axis=1)
-        weight[(rise > np.maximum(room, 0.0)[:, None]) & ~fixed[:, None]] *= _BLOCKED
-    return weight
+    low, high = (bound[upper][:, None] for bound in bounds)
+    leaves = ((target < low - 1e-6) | (target > high + 1e-6)).any(axis=2)
+    return np.where(leaves & (held | (rise > 0.7)), weight * BLOCKED, weight)
 
 
 def _spread(
@@ -609,14 +513,12 @@ def _free_place(wanted: Array, low: Array, high: Array, weight: Index, limits: t
             for axis in range(3)
         ]
         spans = [
-            np.column_stack([np.searchsorted(line, low[near, axis], "right"), np.searchsorted(line, high[near, axis])])
-            for axis, line in enumerate(lines)
+            map(slice, np.searchsorted(line, a, "right").tolist(), np.searchsorted(line, b).tolist())
+            for line, a, b in zip(lines, low[near].T, high[near].T, strict=True)
         ]
-        crowd = np.zeros([len(line) for line in lines], dtype=np.int32)
-        for (x, x_end), (y, y_end), (z, z_end), load in zip(
-            *(span.tolist() for span in spans), weight[near].tolist(), strict=True
-        ):
-            crowd[x:x_end, y:y_end, z:z_end] += load
+        crowd = np.zeros(list(map(len, lines)), dtype=np.int32)
+        for *span, load in zip(*spans, weight[near].tolist(), strict=True):
+            crowd[tuple(span)] += load
         x, y, z = ((line - middle) ** 2 for line, middle in zip(lines, wanted, strict=True))
         least = crowd.min()
         way = np.where(crowd == least, x[:, None, None] + y[:, None] + z, np.inf)

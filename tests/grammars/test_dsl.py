@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.assets import get_library
 from scene_envs.assets.shapes import box, ring, solid
+from scene_envs.assets.support_shapes import upper_side
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import (
     NOTHING,
@@ -37,7 +38,6 @@ from scene_envs.grammars.surface import (
     Outline,
     Placed,
     Rectangle,
-    _top_on_axis,
     carrying_height,
     meet,
     plan_of,
@@ -219,8 +219,7 @@ def test_things_rest_where_a_ray_from_above_hits(name: str) -> None:
 
 
 def test_the_axis_misses_parts_beside_it() -> None:
-    beside = box((0.1, 0.1, 0.1), (0.2, 0.0, 0.0))
-    assert _top_on_axis(beside.vertices[beside.faces]) is None
-    cone = solid([(0.1, 0.0), (0.0, 0.3)], 12)
-    assert _top_on_axis(cone.vertices[cone.faces]) == pytest.approx(0.3)
-    assert all(_top_on_axis(wedge.vertices[wedge.faces]) is None for wedge in ring([(0.1, 0), (0.2, 0), (0.2, 0.1)], 8))
+    axis = np.zeros((1, 1, 2))
+    assert upper_side(box((0.1, 0.1, 0.1), (0.2, 0.0, 0.0)), axis).item() == -math.inf
+    assert upper_side(solid([(0.1, 0.0), (0.0, 0.3)], 12), axis).item() == pytest.approx(0.3)
+    assert all(upper_side(wedge, axis).item() == -math.inf for wedge in ring([(0.1, 0), (0.2, 0), (0.2, 0.1)], 8))

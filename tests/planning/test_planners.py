@@ -59,8 +59,8 @@ def test_a_leaf_as_root_gives_no_plan() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: MCTSPlanner(exploration=-1.0), "exploration must be a number >= 0, got -1.0"),
-        (lambda: BestOfPlanner(parallel=0), "parallel must be a number >= 1, got 0"),
+        (lambda: MCTSPlanner(exploration=-1.0), "exploration=-1.0 must be at least 0"),
+        (lambda: BestOfPlanner(parallel=0), "parallel=0 must be at least 1"),
         (lambda: MCTSPlanner().plan(ToyTree(scrambled), budget=0), "at least 1 expansion, got 0"),
     ],
 )

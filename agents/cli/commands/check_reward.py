@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from agents.configuration.composition import RewardLimitKeys, named
+from scene_envs.errors import Seed
 
 WRITES = False
 
@@ -22,7 +23,7 @@ class CheckRewardConfig(RewardLimitKeys):
 
     reward: Any = named("object_count", "reward")
     scene: Any = named("dimsum_table", "scene")
-    seed: int = 0
+    seed: Seed = 0
 
 
 def run(settings: CheckRewardConfig) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DeviceKeys, ProgressKeys
+from scene_envs.errors import Natural, Seed
 
 
 @dataclass
@@ -23,8 +24,8 @@ class DemoConfig(DeviceKeys, ProgressKeys):
     """
 
     output: str = "runs/demo"
-    seed: int = 0
-    workers: int = 2
+    seed: Seed = 0
+    workers: Natural = 2
 
 
 def run(settings: DemoConfig, run: Run) -> None:

@@ -7,12 +7,20 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior
 from agents.cli.run_folder import Run
 from agents.configuration.composition import MEASURE_NAMES, DrawKeys, OutputKeys
-from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, unknown_name
+from scene_envs.errors import (
+    CorruptFileError,
+    Count,
+    InvalidInputError,
+    MissingDependencyError,
+    Natural,
+    at_least,
+    unknown_name,
+)
 from scene_envs.files import with_digest, without_digest, write_text
 
 if TYPE_CHECKING:
@@ -39,7 +47,7 @@ class RealSceneKeys:
 
     data: str = ""
     heldout: str = ""
-    training_scenes: int = 20_000
+    training_scenes: Count = 20_000
 
 
 @dataclass
@@ -63,20 +71,13 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
     """
 
     prior: str = "dimsum_table"
-    count: int = 200
+    count: Annotated[int, at_least(2)] = 200
     prompt_count: int | None = None
     guidance: float = 0.0
     claim_guidance: float = 0.0
     measures: Any = "all"
     project: bool = True
-    pictures: int = 16
-
-    def __post_init__(self) -> None:
-        if self.count < 2 or self.training_scenes < 1:
-            raise InvalidInputError(
-                f"an evaluation needs count >= 2 and training_scenes >= 1, got count={self.count} and "
-                f"training_scenes={self.training_scenes}"
-            )
+    pictures: Natural = 16
 
 
 def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> list[str]:

@@ -6,12 +6,12 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from agents.cli.commands.scenes import draw, load_prior, make_ready
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Count, InvalidInputError, Natural, at_least
 
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
@@ -29,8 +29,8 @@ class ExportConfig(DrawKeys):
         scenes: a scene file, a folder of scene files, the folder of a sample or project run (its simulation-ready
             scenes if it has any), or a dataset.
         prior: a prior from which scenes are drawn, in place of scenes=: a shipped name or a folder.
-        formats: one or several of urdf, sdf, drake, mjcf, usd, glb, npz, written as [drake, mjcf]; all for
-            every format whose packages are installed.
+        formats: one or several of urdf, sdf, drake, mjcf, usd, glb, npz, worlds, written as [drake, mjcf]; all
+            for every format with a file per scene whose packages are installed.
         count: number of scenes; null for all of them, or 16 from a prior.
         project: make the scenes simulation-ready first (project out of penetration, then settle).
         friction: coefficient of friction of all surfaces.
@@ -42,10 +42,10 @@ class ExportConfig(DrawKeys):
     scenes: str = ""
     prior: str = ""
     formats: Any = "all"
-    count: int | None = None
+    count: Count | None = None
     project: bool = False
-    friction: float = 0.6
-    workers: int = 2
+    friction: Annotated[float, at_least(0)] = 0.6
+    workers: Natural = 2
     physics: str = "auto"
     output: str = ""
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from agents.cli.run_folder import Run
-from agents.configuration.composition import ProgressKeys, named, require_one_of
+from agents.configuration.composition import ProgressKeys, named
+from scene_envs.errors import Count, Natural, OneOf, Seed
 
 
 @dataclass
@@ -28,20 +29,15 @@ class GenerateConfig(ProgressKeys):
     """
 
     scene: Any = named("dimsum_table", "scene")
-    count: int = 1000
-    seed: int = 0
-    workers: int = 2
+    count: Count = 1000
+    seed: Seed = 0
+    workers: Natural = 2
     physics: str = "auto"
     verify: bool = True
-    shard_size: int = 2000
-    backend: str = "processes"
+    shard_size: Count = 2000
+    backend: Annotated[str, OneOf(("processes", "ray"))] = "processes"
     address: str | None = None
     output: str = ""
-
-
-def check(settings: GenerateConfig) -> None:
-    """Refuse impossible settings before anything is imported."""
-    require_one_of(settings, "backend", ("processes", "ray"))
 
 
 def run(settings: GenerateConfig, run: Run) -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 from agents.cli.commands.scenes import check_files
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DeviceKeys, named
 from scene_envs.arrays import resolve_device
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Count, InvalidInputError, Natural, Seed
 
 POSITIONAL = ("checkpoint", "metadata")
 """Words without ``=`` fill these keys, in this order."""
@@ -33,17 +32,14 @@ class ImportCheckpointConfig(DeviceKeys):
         output: folder for prior/ and, with a trial, scenes.safetensors.
     """
 
-    LEAST: ClassVar[Mapping[str, int]] = {"count": 0}
-    """Numbers that may be less here than in other commands."""
-
     checkpoint: str = ""
     metadata: str = ""
     scene: Any = named("", "scene")
     aliases: dict[str, str] = field(default_factory=dict)
     text_encoder: str = ""
-    count: int = 4
-    num_steps: int = 50
-    seed: int = 0
+    count: Natural = 4
+    num_steps: Count = 50
+    seed: Seed = 0
     output: str = ""
 
 

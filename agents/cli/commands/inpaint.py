@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys, PromptKeys
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Count, InvalidInputError, Natural, at_least
 
 if TYPE_CHECKING:
     from agents.priors.prior import ScenePrior
@@ -39,8 +39,8 @@ class InpaintingConfig(PromptKeys, DrawKeys):
 
     scenes: str = ""
     prior: str = ""
-    count: int | None = None
-    pictures: int = 12
+    count: Count | None = None
+    pictures: Natural = 12
     output: str = ""
 
     def in_parts(self, batch: SceneBatch, change: Callable[..., SceneBatch], **keys: Any) -> SceneBatch:
@@ -105,8 +105,8 @@ class CompleteConfig(InpaintingConfig):
         fill: most objects to add to a scene; null for as many as there are empty slots.
     """
 
-    slots: int | None = None
-    fill: int | None = None
+    slots: Count | None = None
+    fill: Annotated[int, at_least(0)] | None = None
 
 
 def run_complete(settings: CompleteConfig, run: Run) -> None:

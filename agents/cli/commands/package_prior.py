@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from agents.configuration.composition import require_one_of
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Checked, InvalidInputError, OneOf
 
 WRITES = False
 
 
 @dataclass
-class PackagePriorConfig:
+class PackagePriorConfig(Checked):
     """A prior as a folder to publish: configuration, weights in half precision, model card.
 
     Attributes:
@@ -35,7 +34,7 @@ class PackagePriorConfig:
     prior: str = ""
     output: str = ""
     evaluation: str = ""
-    precision: str = "float16"
+    precision: Annotated[str, OneOf(("float16", "float32"))] = "float16"
     data: str = ""
     license: str = ""
     machine: str = ""
@@ -49,7 +48,6 @@ def check(settings: PackagePriorConfig) -> None:
         raise InvalidInputError(
             "package-prior: name the prior and its new folder, as in prior=runs/mine output=priors/mine"
         )
-    require_one_of(settings, "precision", ("float16", "float32"))
 
 
 def run(settings: PackagePriorConfig) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from agents.cli.commands.scenes import draw_scenes, make_ready
 from agents.cli.run_folder import Run
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Checked, Count, InvalidInputError, Natural
 
 
 @dataclass
-class ProjectConfig:
+class ProjectConfig(Checked):
     """Scenes made simulation-ready.
 
     Attributes:
@@ -24,9 +24,9 @@ class ProjectConfig:
     """
 
     scenes: str = ""
-    count: int | None = None
-    pictures: int = 12
-    workers: int = 2
+    count: Count | None = None
+    pictures: Natural = 12
+    workers: Natural = 2
     physics: str = "auto"
     output: str = ""
 

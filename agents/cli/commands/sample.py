@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from agents.cli.commands.export import export_scenes
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior, make_ready, object_counts, reward_figures
 from agents.cli.run_folder import Run
-from agents.configuration.composition import DrawKeys, OutputKeys, RewardLimitKeys, SamplingKeys, named, require_one_of
-from scene_envs.errors import InvalidInputError
+from agents.configuration.composition import DrawKeys, OutputKeys, RewardLimitKeys, SamplingKeys, named
+from scene_envs.errors import Count, InvalidInputError, OneOf, at_least
 
 if TYPE_CHECKING:
     from scene_envs.scene import SceneBatch
@@ -35,9 +35,9 @@ class SampleConfig(SamplingKeys, DrawKeys, RewardLimitKeys, OutputKeys):
     """
 
     prior: str = "dimsum_table"
-    count: int = 16
-    eta: float = 1.0
-    union: str = "one_type"
+    count: Count = 16
+    eta: Annotated[float, at_least(0)] = 1.0
+    union: Annotated[str, OneOf(("one_type", "any"))] = "one_type"
     reward: Any = named("feasible_objects", "reward")
     project: bool = False
     export: Any = None
@@ -47,7 +47,6 @@ def check(settings: SampleConfig) -> None:
     """Refuse impossible settings before a prior is loaded."""
     from scene_envs.export.formats import check_formats
 
-    require_one_of(settings, "union", ("one_type", "any"))
     if settings.export is not None:
         check_formats(settings.export)
 

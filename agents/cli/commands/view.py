@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior, object_counts
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys, named
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import Count, InvalidInputError, Natural
 from scene_envs.files import find_scenes, is_dataset
 
 if TYPE_CHECKING:
@@ -37,10 +37,10 @@ class ViewConfig(DrawKeys):
     scenes: str = ""
     prior: str = ""
     scene: Any = named("", "scene")
-    count: int = 16
-    first: int = 0
+    count: Count = 16
+    first: Natural = 0
     title: str | None = None
-    pictures: int = 12
+    pictures: Natural = 12
     open: bool = False
     output: str = ""
 

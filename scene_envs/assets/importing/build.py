@@ -25,8 +25,7 @@ from scene_envs.assets.importing.mesh_files import (
     merged_inertial,
     pose_of,
 )
-from scene_envs.assets.importing.robot_files import read_sdf, read_urdf
-from scene_envs.assets.importing.simulator_files import read_mjcf, read_usd
+from scene_envs.assets.importing.robot_files import read_mjcf, read_sdf, read_urdf, read_usd
 from scene_envs.assets.importing.solids import (
     Method,
     PartAudit,

@@ -33,7 +33,7 @@ from scene_envs.assets.importing.limits import (
     too_slow,
 )
 from scene_envs.assets.importing.mesh_files import Color, find_mesh, read_xml
-from scene_envs.assets.importing.simulator_files import open_stage
+from scene_envs.assets.importing.robot_files import open_stage
 from scene_envs.assets.importing.solids import audit_parts
 from scene_envs.assets.recipes import RECIPES
 from scene_envs.errors import InvalidInputError, SceneEnvsError
