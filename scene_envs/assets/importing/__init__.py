@@ -1,4 +1,4 @@
-"""Import of users' assets: folders of URDF, SDF and mesh files as asset libraries."""
+"""Import of users' assets: folders of URDF, SDF, MJCF, USD and mesh files as asset libraries."""
 
 from scene_envs.assets.importing.build import AssetReport, ImportReport
 from scene_envs.assets.importing.user_library import import_report, load_library

@@ -25,7 +25,7 @@ from scene_envs.assets.importing.mesh_files import (
     merged_inertial,
     pose_of,
 )
-from scene_envs.assets.importing.robot_files import read_sdf, read_urdf
+from scene_envs.assets.importing.robot_files import read_mjcf, read_sdf, read_urdf, read_usd
 from scene_envs.assets.importing.solids import (
     Method,
     PartAudit,
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 YAML_NAMES = ("library.yaml", "library.yml")
-SUFFIXES = (".urdf", ".sdf", *MESH_SUFFIXES)
+SUFFIXES = (".urdf", ".sdf", ".xml", ".usd", ".usda", ".usdc", *MESH_SUFFIXES)
 """Files that can become assets."""
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Base = Literal["bottom", "origin"]
@@ -349,7 +349,9 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
         warnings += weight.warnings
     visual = join(*(mesh for shape in model.visuals or shapes for mesh in visual_of(shape, entry.color)))
     meshes = [shape for shape in (*model.visuals, *shapes) if shape.kind == "mesh"]
-    notes += dict.fromkeys(note for shape in meshes for mesh in meshes_of(shape) for note in mesh.metadata["notes"])
+    notes += dict.fromkeys(
+        note for shape in meshes for mesh in meshes_of(shape) for note in mesh.metadata.get("notes", ())
+    )
     shift = _shift(parts, entry, visual if static else None)
     apart = float(np.abs(np.asarray(visual.bounds) - bounds_of(parts)).max())
     if apart > max(_UNLIKE, 0.05 * size):
@@ -378,10 +380,9 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
 
 def _read(path: Path) -> Model:
     suffix = path.suffix.lower()
-    if suffix == ".urdf":
-        return read_urdf(path)
-    if suffix == ".sdf":
-        return read_sdf(path)
+    readers = {".urdf": read_urdf, ".sdf": read_sdf, ".xml": read_mjcf}
+    if reader := read_usd if suffix.startswith(".usd") else readers.get(suffix):
+        return reader(path)
     shape = Shape("mesh", (1.0, 1.0, 1.0), np.eye(4), "the mesh", path)
     shape = dataclasses.replace(shape, pose=pose_of(np.zeros(3), meshes_of(shape)[0].metadata["upright"]))
     return Model(visuals=(shape,), collisions=(shape,))

@@ -50,7 +50,7 @@ _SAMPLES = np.array(
     [[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)], dtype=np.float64
 ) / 4.0  # fmt: skip
 """Barycentric points (15, 3) at which a texture is read to colour a triangle."""
-_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _UPRIGHT = {"X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "Z_UP": np.eye(3)}
 FORMATS: dict[str, Any] = json.loads(Path(__file__).with_name("formats.json").read_text("utf-8"))
 """What is read and left out of formats: children and @attributes of elements, those with a * any number of times."""
@@ -72,6 +72,7 @@ class Shape:
     is_convex: bool = False  # whether the model declares the mesh convex
     part: tuple[str, bool] | None = None  # the one object of a mesh file, and whether its box is centred at the origin
     density: float | None = None  # kg/m^3, given by the model
+    surface: trimesh.Trimesh | None = None  # the mesh itself, where it is no file of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,7 +320,7 @@ def _prepare_dae(content: _Content) -> None:
     root = _parsed(content.data, content.path)
     if (unit := root.find("asset/unit")) is not None:
         content.axes = np.eye(3) * positive(unit.get("meter", "1"), 1, content.path, "unit of the asset")[0]
-    content.upright = _UPRIGHT.get((root.findtext("asset/up_axis") or "").strip(), _Y_UP)
+    content.upright = _UPRIGHT.get((root.findtext("asset/up_axis") or "").strip(), Y_UP)
     images = [(i.text or "").strip() for i in root.findall("library_images/image//init_from")]
     known = {i.get(key) for key, tag in (("id", "image"), ("sid", "newparam")) for i in root.iter(tag)}
     images += [i.get("texture", "") for i in root.iter("texture") if i.get("texture") not in known]
@@ -420,7 +421,7 @@ def _check_texture(mesh: Any, path: Path) -> None:
 
 def _prepare_gltf(content: _Content) -> None:
     """Scales of quantised positions, and what is not loaded; refuses by its name what trimesh does not read."""
-    content.axes = _Y_UP
+    content.axes = Y_UP
     looks, lost = (tuple(names.split()) for names in FORMATS["glTF"].values())
     size = int.from_bytes(content.data[12:16], "little")
     header = json.loads(content.data[20 : 20 + size] if content.type == "glb" else content.data)

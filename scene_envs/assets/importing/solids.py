@@ -212,6 +212,8 @@ def _holds(outer: trimesh.Trimesh, inner: trimesh.Trimesh) -> bool:
 
 
 def _hull(points: Array, tolerance: float) -> ConvexPart:
+    if tolerance == 0 and len((full := convex_hull(points)).vertices) <= 2 * MAX_CORNERS:
+        return full
     return few_cornered_hull(np.asarray(points, dtype=np.float64), 0.25 * tolerance)[0]
 
 
@@ -362,7 +364,8 @@ def meshes_of(shape: Shape) -> list[trimesh.Trimesh]:
     and InvalidInputError for an object that its file does not hold.
     """
     assert shape.path is not None
-    found = _file(shape.path, shape.path.stat().st_mtime_ns if shape.path.is_file() else 0)
+    found: tuple[trimesh.Trimesh, ...] = () if shape.surface is None else (shape.surface,)
+    found = found or _file(shape.path, shape.path.stat().st_mtime_ns if shape.path.is_file() else 0)
     meshes: list[Any] = [m.copy() for m in found if shape.part is None or shape.part[0] in m.metadata["names"]]
     if shape.part is not None and not meshes:
         known = ", ".join(sorted({repr(name) for mesh in found for name in mesh.metadata["names"]}))
@@ -418,6 +421,7 @@ def collision_of(shape: Shape, method: Method, tolerance: float, threshold: floa
     solids = []
     for surface in _surfaces(shape):
         how: Method = "convex" if shape.is_convex else method
+        tolerance *= not shape.is_convex  # what is convex keeps its corners
         parts, solid, *remarks = convex_parts(surface, how, tolerance, threshold, f"{shape.path.name} ({shape.where})")
         solids.append(solid)
         result.parts.extend(parts)
@@ -441,6 +445,8 @@ def solid_of(shape: Shape) -> MassProperties:
     """The solid of a shape at 1 kg/m^3, in closed form for primitives; InvalidInputError for a mesh that is open."""
     if shape.kind == "mesh":
         bodies = _closed([piece for mesh in _surfaces(shape) for piece in mesh.split(only_watertight=False)])
+        if not bodies and shape.is_convex:
+            bodies = [convex_hull(np.concatenate([mesh.vertices for mesh in meshes_of(shape)]))]
         if not bodies:
             raise InvalidInputError(f"{shape.path}: {shape.where} has no mass, as it is not closed; give a mass")
         return mass_properties(bodies, volume(bodies))

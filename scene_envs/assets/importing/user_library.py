@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import logging
 import os
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -32,20 +33,21 @@ from scene_envs.assets.importing.limits import (
     too_slow,
 )
 from scene_envs.assets.importing.mesh_files import Color, find_mesh, read_xml
+from scene_envs.assets.importing.robot_files import open_stage
 from scene_envs.assets.importing.solids import audit_parts
 from scene_envs.assets.recipes import RECIPES
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.workers import WorkerFailure, run_apart
 
 _LOGGER = logging.getLogger(__name__)
-_DESCRIPTIONS = (".urdf", ".sdf")
+_DESCRIPTIONS = (".urdf", ".sdf", ".xml", ".usd", ".usda", ".usdc")
 
 
 def load_library(folder: str | os.PathLike[str]) -> AssetLibrary:
-    """All assets of a folder of URDF, SDF, OBJ, STL, GLB, PLY, OFF or COLLADA files.
+    """All assets of a folder of URDF, SDF, MJCF, USD, OBJ, STL, GLB, PLY, OFF or COLLADA files.
 
     ``library.yaml`` in the folder lists the assets; see :class:`AssetEntry` for its keys. Without it, every file that
-    can be read becomes an asset with the name of the file, except meshes that a URDF or SDF of the folder uses. Files
+    can be read becomes an asset with the name of the file, except what a model of the folder uses. Files
     that cannot be read are left out. The log and :func:`import_report` list these choices and all corrections. Each
     file is read once per process.
 
@@ -135,6 +137,7 @@ def _listed(path: Path, stamp: tuple[int, int]) -> FolderIndex:
 @cache
 def _unlisted(folder: Path, stamp: tuple[int, int]) -> FolderIndex:
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    files = [path for path in files if path.suffix.lower() != ".xml" or re.search(rb"<mujoco[\s>]", path.read_bytes())]
     used = {mesh for path in files if path.suffix.lower() in _DESCRIPTIONS for mesh in _named_files(path)}
     entries = [default_entry(str(path.relative_to(folder))) for path in files if path.resolve() not in used]
     if not entries:
@@ -146,12 +149,16 @@ def _unlisted(folder: Path, stamp: tuple[int, int]) -> FolderIndex:
 
 
 def _named_files(path: Path) -> set[Path]:
-    """The meshes that a URDF or SDF uses; empty when it cannot be read."""
+    """The files that a URDF, SDF, MJCF or USD uses; empty when it cannot be read."""
     try:
+        if path.suffix.lower().startswith(".usd"):
+            stage = open_stage(path)
+            return {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers()} - {path.resolve()}
         root = read_xml(path)
     except SceneEnvsError:
         return set()
-    found = set()
+    places = [compiler.get("meshdir", "") for compiler in root.iter("compiler")] or [""]
+    found = {(path.parent / place / mesh.get("file", "")).resolve() for mesh in root.iter("mesh") for place in places}
     for uri in [mesh.get("filename") or mesh.findtext("uri") or "" for mesh in root.iter("mesh")]:
         with contextlib.suppress(SceneEnvsError, OSError):
             found.add(find_mesh(uri, path, "a mesh"))
