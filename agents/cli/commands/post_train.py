@@ -1,8 +1,9 @@
-"""``scene-envs post-train``."""
+"""``scene-envs post-train`` and ``doctor``."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 from agents.cli.run_folder import Run
@@ -47,3 +48,19 @@ def say_change(metrics: Mapping[str, Any], run: Run) -> None:
     run.say(f"{'held-out loss':<20} {metrics['guard']['ratio']:.2f}x of the base prior's")
     if before["invalid_scenes"] or after["invalid_scenes"]:
         run.say(f"{'simulation ended':<20} {before['invalid_scenes']:6.0f} -> {after['invalid_scenes']:6.0f} scenes")
+
+
+def run_doctor(settings: PostTrainConfig, run: Run) -> None:
+    """Examine the run that ``post-train`` would make of these settings."""
+    from rich.console import Console
+
+    from agents.post_training.doctor import diagnose
+
+    report = diagnose(settings)
+    run.write_metrics(report.metrics())
+    Console().print(report)
+    for line in report.advice:
+        run.log(line)
+
+
+doctor = SimpleNamespace(run=run_doctor)
