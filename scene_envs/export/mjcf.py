@@ -30,6 +30,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     collision = ET.SubElement(defaults, "default", {"class": "collision"})
     contact = {"friction": f"{number(files.friction)} 0.005 0.0001", "solref": numbers(SOLREF)}
     contact["solimp"] = numbers(SOLIMP[:3])  # the others are MuJoCo's defaults
+    contact["gap"] = "0"  # Newton takes 0.1 m where a file says nothing, and stacks burst
     ET.SubElement(collision, "geom", {"type": "mesh", "group": "3", "mass": "0", **contact})
     shared, world = ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody")
     _add_view(root, shared, world, scene.scene_type.camera)

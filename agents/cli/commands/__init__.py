@@ -19,6 +19,7 @@ COMMANDS = {
     "search": "search for scenes that score high, at inference time",
     "project": "make scenes simulation-ready: project out of penetration, then settle",
     "export": "write scenes for simulators and viewers: URDF, SDF, Drake, MJCF, USD, GLB, arrays",
+    "verify": "judge exported scenes in every engine and simulator that is installed",
     "view": "write a page that shows scenes in a browser: a dataset, samples, a prior or a grammar",
     "evaluate": "measure the samples of a prior against real scenes",
     "priors": "list the shipped priors",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -105,6 +107,19 @@ def export_scenes(
         "bytes": report.size,
         "seconds": round(seconds, 3),
     }
+
+
+def keep_verified(batch: SceneBatch, formats: Sequence[str], run: Run, **keys: Any) -> SceneBatch:
+    """The scenes that all judges find ready in an export with these keys; the verdicts on all go into the run."""
+    from scene_envs.export import export, verify
+
+    with tempfile.TemporaryDirectory(dir=run.directory) as folder:
+        export(batch, folder, [*formats, "npz"], **keys)
+        report = verify(folder)
+        for name in ("verify.json", "verify.txt"):
+            shutil.move(Path(folder, name), run.directory / name)
+    run.say(f"{report}; {report.ready.count(False)} dropped")
+    return batch[[index for index, ready in enumerate(report.ready) if ready]]
 
 
 def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:

@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from agents.cli.commands.export import export_scenes
+from agents.cli.commands.export import export_scenes, keep_verified
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior, make_ready, object_counts, reward_figures
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys, OutputKeys, RewardLimitKeys, SamplingKeys, named, require_one_of
@@ -29,6 +29,7 @@ class SampleConfig(SamplingKeys, DrawKeys, RewardLimitKeys, OutputKeys):
         project: also make the samples simulation-ready (project out of penetration, then settle).
         export: formats of the exported scenes, as drake or [drake, mjcf]; null for none. With project=true the
             simulation-ready scenes are exported. See scene-envs export.
+        verify: export only scenes that all installed engines and simulators find ready; needs project=true and export=.
         output: folder for scenes.safetensors and gallery.png, with project=true also ready.safetensors and ready.png;
             exported scenes are in its folder export/.
     """
@@ -40,6 +41,7 @@ class SampleConfig(SamplingKeys, DrawKeys, RewardLimitKeys, OutputKeys):
     reward: Any = named("feasible_objects", "reward")
     project: bool = False
     export: Any = None
+    verify: bool = False
 
 
 def check(settings: SampleConfig) -> None:
@@ -49,6 +51,8 @@ def check(settings: SampleConfig) -> None:
     require_one_of(settings, "union", ("one_type", "any"))
     if settings.export is not None:
         check_formats(settings.export)
+    if settings.verify and not (settings.project and settings.export is not None):
+        raise InvalidInputError("verify=true judges exported scenes; add project=true and export=, as export=mjcf")
 
 
 def run(settings: SampleConfig, run: Run) -> None:
@@ -112,6 +116,8 @@ def run(settings: SampleConfig, run: Run) -> None:
             metrics["ready"] = make_ready(batch, settings.pictures, pool, run)
             batch = SceneBatch.load(run.directory / "ready.safetensors")
         if formats is not None:
+            if settings.verify:
+                batch = keep_verified(batch, formats, run)
             metrics["export"] = export_scenes(batch, formats, run.directory / "export", pool, run)
     run.write_metrics(metrics)
     run.say(f"written to {run.directory}")

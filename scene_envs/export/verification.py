@@ -1,0 +1,292 @@
+"""Verdicts of engines and simulators on exported scenes, which each of them reads from the exported files."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import logging
+import os
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.files import write_json, write_text
+from scene_envs.physics.parts import FRICTION, GRAVITY, angle_between
+
+LIMITS = {"overlap, mm": 1.0, "motion in 0.1 s, mm": 1.0, "rotation in 0.1 s, mrad": 10.0, "motion in 2 s, mm": 1.0}
+"""The figures that a judge finds for each object, and what they are at most for an object that is ready."""
+_TIMES = (0.1, 2.0)
+_BULLET_RATE, _DRAKE_STEP = 240, 0.002  # steps a second, and s, which no file says
+Objects = dict[str, Sequence[float]]
+"""The figures of ``LIMITS`` for each object of a scene."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one judge finds in one scene: its largest figures, in the order of ``LIMITS``, its time (s), and a line for
+    each object beyond a limit, or for a file that the judge could not simulate.
+    """
+
+    scene: str
+    judge: str
+    largest: tuple[float, ...]
+    seconds: float
+    faults: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Verdicts of all judges on an export.
+
+    Attributes:
+        scenes: Folders of the scenes, in order.
+        findings: One for each judge and scene.
+        versions: Version of the simulator of each judge.
+        missing: Judges that did not take part, with the line that installs them or another reason.
+    """
+
+    scenes: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    versions: dict[str, str]
+    missing: dict[str, str]
+
+    @property
+    def ready(self) -> tuple[bool, ...]:
+        """For each scene, whether all judges find it ready."""
+        return tuple(not any(found.faults for found in self.findings if found.scene == name) for name in self.scenes)
+
+    def __str__(self) -> str:
+        titles = ("overlap, mm", "0.1 s: mm", "mrad", "2 s: mm", "seconds")
+        lines = ["".join([f"{'judge':18}{'version':10}{'ready':10}", *(f"{title:>13}" for title in titles)])]
+        for judge, version in self.versions.items():
+            found = [finding for finding in self.findings if finding.judge == judge]
+            ready = f"{sum(not finding.faults for finding in found)} of {len(found)}"
+            figures = [*np.max([f.largest for f in found], axis=0), sum(f.seconds for f in found)]
+            lines.append("".join([f"{judge:18}{version:10}{ready:10}", *(f"{figure:13.3f}" for figure in figures)]))
+        lines += [f"not asked: {judge}, {reason}" for judge, reason in self.missing.items()]
+        lines += [f"{found.scene}, {found.judge}: {fault}" for found in self.findings for fault in found.faults]
+        return "\n".join([*lines, f"{sum(self.ready)} of {len(self.scenes)} scenes are ready for all judges"])
+
+
+def verify(path: str | os.PathLike[str]) -> Verification:
+    """Judge an export in every engine and simulator that is installed, and write ``verify.json`` and ``verify.txt``.
+
+    A scene is ready for a judge when no figure of an object is beyond ``LIMITS``; nothing is removed. Friction, masses
+    and contact settings are those of the files; only the engines of :mod:`scene_envs.physics` have their own.
+
+    Args:
+        path: Folder of an export, or of a run that holds one in ``export/``.
+
+    Raises:
+        InvalidInputError: the folder holds no scenes, or none of its files has a judge here.
+        CorruptFileError: ``export.json`` cannot be read.
+    """
+    root = next((p for p in (Path(path), Path(path, "export")) if (p / "export.json").is_file()), None)
+    if root is None:
+        raise InvalidInputError(f"{str(path)!r} holds no export.json; name the folder of an export, as runs/mine")
+    try:
+        manifest = json.loads((root / "export.json").read_text())
+        count, digest, friction = (manifest[key] for key in ("scenes", "digest", "friction"))
+    except (ValueError, KeyError, TypeError) as error:
+        raise CorruptFileError(f"{str(root / 'export.json')!r} is no manifest of an export: {error}") from error
+    folders = sorted(folder for folder in root.glob("scene_[0-9]*") if folder.is_dir())
+    if len(folders) != count or not folders:
+        raise InvalidInputError(f"{str(root)!r} holds {len(folders)} of {count} scenes; export scenes into it first")
+    findings: list[Finding] = []
+    versions: dict[str, str] = {}
+    missing: dict[str, str] = {}
+    for judge, (file, module, package, judged) in JUDGES.items():
+        if find_spec(module) is None:
+            missing[judge] = f"not installed: pip install {package}"
+        elif not all((folder / file).is_file() for folder in folders):
+            missing[judge] = f"no {file} in the export"
+        elif file == _POSES and (friction != FRICTION or "randomization" in manifest):
+            missing[judge] = "has other friction or masses than the files"
+        else:
+            versions[judge] = importlib.metadata.version(package.strip('"').partition("[")[0])
+            findings += [_find(judge, judged, root, folder) for folder in folders]
+    if not versions:
+        raise InvalidInputError(f"{str(root)!r} has no file that can be judged here: {missing}")
+    report = Verification(tuple(folder.name for folder in folders), tuple(findings), versions, missing)
+    rows = [vars(found) | {"largest": dict(zip(LIMITS, found.largest, strict=True))} for found in findings]
+    verdict = {"digest": digest, "ready": all(report.ready), "ready_scenes": report.ready, "limits": LIMITS}
+    write_json(root / "verify.json", verdict | vars(report) | {"findings": rows})
+    write_text(root / "verify.txt", f"{report}\n")
+    return report
+
+
+def _find(judge: str, judged: Callable[[Path, Path], Objects], root: Path, folder: Path) -> Finding:
+    started, faults, objects = time.perf_counter(), [], {"": [np.inf] * len(LIMITS)}
+    try:
+        objects = judged(root, folder)
+    except Exception as error:  # the simulator does not take the file, or gives up
+        faults.append(" ".join(f"not simulated, {type(error).__name__}: {error}".split())[:400])
+    for name, figures in objects.items() if not faults else ():
+        over = [f"{key} {x:.2f}" for (key, most), x in zip(LIMITS.items(), figures, strict=True) if not x <= most]
+        faults += [f"{name}: {', '.join(over)}"] if over else []
+    largest = np.max([*objects.values(), [0.0] * len(LIMITS)], axis=0).tolist()
+    return Finding(folder.name, judge, tuple(largest), time.perf_counter() - started, tuple(faults))
+
+
+def _objects(names: Sequence[str], depth: dict[str, float], poses: Callable[[float], ArrayLike]) -> Objects:
+    """The figures of objects from their overlaps (m) and their poses (n, 7) after a time (s): translation (m) and
+    quaternion, in any order of its parts. Times are asked for in ascending order.
+    """
+    start, early, late = (np.array(poses(seconds), dtype=np.float64).reshape(-1, 7) for seconds in (0.0, *_TIMES))
+    moved, drifted = (np.linalg.norm(rows[:, :3] - start[:, :3], axis=1) for rows in (early, late))
+    overlap = np.array([max(0.0, depth.get(name, 0.0)) for name in names])
+    figures = np.stack([overlap, moved, angle_between(early[:, 3:], start[:, 3:]), drifted], axis=1)
+    return dict(zip(names, (1e3 * figures).tolist(), strict=True))
+
+
+def _engine(physics: str, root: Path, folder: Path) -> Objects:
+    import torch
+
+    from scene_envs.physics import equilibrium, penetration
+    from scene_envs.scene import SceneBatch
+
+    found = np.load(folder / _POSES)
+    parts = [torch.from_numpy(found[key])[None] for key in ("translations", "rotations", "categories")]
+    batch = SceneBatch.from_parts(parts[0].float(), parts[1].float(), parts[2], str(found["scene_type"]))
+    overlap = penetration(batch, physics=physics)
+    early, late = (equilibrium(batch, duration=seconds, physics=physics) for seconds in _TIMES)
+    if not (overlap.valid & early.valid & late.valid).all():
+        raise InvalidInputError("objects overlap too deeply")
+    figures = torch.cat([overlap.depth, early.displacement, early.rotation, late.displacement]).T
+    return dict(zip(found["names"].tolist(), (1e3 * figures).tolist(), strict=True))
+
+
+def _mujoco(root: Path, folder: Path) -> Objects:
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+    return _simulated(model, [model.body(index).name for index in range(1, model.nbody)])
+
+
+def _newton(file: str, root: Path, folder: Path) -> Objects:
+    """Newton's reading of a file, by its MuJoCo solver."""
+    import newton
+    import warp
+
+    warp.config.quiet = True
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        builder = newton.ModelBuilder()
+        newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+        (builder.add_usd if file.endswith(".usda") else builder.add_mjcf)(str(folder / file))
+        solver = newton.solvers.SolverMuJoCo(builder.finalize(device="cpu"), use_mujoco_cpu=True)
+    bodies = solver.mjc_body_to_newton.numpy()[0, 1:]
+    return _simulated(solver.mj_model, [builder.body_label[body].rpartition("/")[2] for body in bodies])
+
+
+def _simulated(model: Any, names: Sequence[str]) -> Objects:
+    """A simulation by MuJoCo, of bodies with these names behind the world's."""
+    import mujoco
+
+    data, flags, iterations = mujoco.MjData(model), model.opt.disableflags, model.opt.ccd_iterations
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD  # the distance of a single contact is a depth
+    model.opt.ccd_iterations = 200
+    mujoco.mj_forward(model, data)
+    depth: dict[str, float] = {}
+    for contact in data.contact:
+        for name in (["", *names][body] for body in model.geom_bodyid[contact.geom]):
+            depth[name] = max(depth.get(name, 0.0), -contact.dist)
+    model.opt.disableflags, model.opt.ccd_iterations = flags, iterations
+    mujoco.mj_resetData(model, data)
+
+    def poses(seconds: float) -> ArrayLike:
+        mujoco.mj_step(model, data, round((seconds - data.time) / model.opt.timestep))
+        mujoco.mj_kinematics(model, data)
+        return np.hstack([data.xpos[1:], data.xquat[1:]])
+
+    return _objects(names, depth, poses)
+
+
+def _pybullet(root: Path, folder: Path) -> Objects:
+    import pybullet
+    from pybullet_utils.bullet_client import BulletClient
+    from scipy.spatial.transform import Rotation
+
+    client, bodies, done = BulletClient(pybullet.DIRECT), {}, 0
+    client.setGravity(0.0, 0.0, -GRAVITY)
+    for item in json.loads((folder / "objects.json").read_text())["objects"]:
+        path, turn = str(folder / item["bullet_urdf"]), np.roll(item["quaternion_wxyz"], -1).tolist()
+        flags = pybullet.URDF_USE_INERTIA_FROM_FILE
+        body = client.loadURDF(path, item["translation"], turn, useFixedBase=item["welded"], flags=flags)
+        bodies[item["name"]] = body, client.getDynamicsInfo(body, -1)[3:5]
+    client.performCollisionDetection()
+    contacts = {name: client.getContactPoints(bodyA=body) for name, (body, _) in bodies.items()}
+    depth = {name: max((-contact[8] for contact in rows), default=0.0) for name, rows in contacts.items()}
+
+    def poses(seconds: float) -> ArrayLike:
+        nonlocal done
+        while done < round(_BULLET_RATE * seconds):
+            client.stepSimulation()
+            done += 1
+        rows = []
+        for body, (center, axes) in bodies.values():  # PyBullet moves the principal frame of inertia
+            position, turn = client.getBasePositionAndOrientation(body)
+            rotation = Rotation.from_quat(turn) * Rotation.from_quat(axes).inv()
+            rows.append([*(position - rotation.apply(center)), *turn])
+        return rows
+
+    return _objects(list(bodies), depth, poses)
+
+
+def _drake(file: str, root: Path, folder: Path) -> Objects:
+    from pydrake.multibody.parsing import Parser
+    from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+    from pydrake.systems.analysis import Simulator
+    from pydrake.systems.framework import DiagramBuilder
+
+    logging.getLogger("drake").setLevel(logging.ERROR)  # a line for each part of an SDF
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=_DRAKE_STEP)
+    parser = Parser(plant)
+    if file.endswith(".yaml"):
+        parser.package_map().AddPackageXml(str(root / "package.xml"))
+    models = parser.AddModels(str(folder / file))
+    plant.Finalize()
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = plant.GetMyContextFromRoot(simulator.get_context())
+    bodies = {plant.GetModelInstanceName(m): plant.get_body(plant.GetBodyIndices(m)[0]) for m in models}
+    owner = {g: name for name, body in bodies.items() for g in plant.GetCollisionGeometriesForBody(body)}
+    query = plant.get_geometry_query_input_port().Eval(context)
+    depth: dict[str, float] = {}
+    for pair in query.ComputePointPairPenetration():
+        value = pair.depth
+        if value > 1e-3:  # the search may end at a way out that is not the shortest; the other one fails on contacts
+            value = min(value, -query.ComputeSignedDistancePairClosestPoints(pair.id_A, pair.id_B).distance)
+        for name in (owner[pair.id_A], owner[pair.id_B]):
+            depth[name] = max(depth.get(name, 0.0), value)
+
+    def poses(seconds: float) -> ArrayLike:
+        simulator.AdvanceTo(seconds)
+        found = [plant.EvalBodyPoseInWorld(context, body) for body in bodies.values()]
+        return [[*pose.translation(), *pose.rotation().ToQuaternion().wxyz()] for pose in found]
+
+    return _objects(list(bodies), depth, poses)
+
+
+_POSES, _NEWTON = "scene.npz", '"newton[sim,importers]"'
+JUDGES: dict[str, tuple[str, str, str, Callable[[Path, Path], Objects]]] = {
+    "bullet engine": (_POSES, "pybullet", "pybullet", partial(_engine, "bullet")),
+    "mujoco engine": (_POSES, "mujoco", "mujoco", partial(_engine, "mujoco")),
+    "MuJoCo, MJCF": ("scene.xml", "mujoco", "mujoco", _mujoco),
+    "Newton, MJCF": ("scene.xml", "newton", _NEWTON, partial(_newton, "scene.xml")),
+    "Newton, USD": ("scene.usda", "newton", _NEWTON, partial(_newton, "scene.usda")),
+    "PyBullet, URDF": ("objects.json", "pybullet", "pybullet", _pybullet),
+    "Drake, directives": ("scene.dmd.yaml", "pydrake", "drake", partial(_drake, "scene.dmd.yaml")),
+    "Drake, SDF": ("world.sdf", "pydrake", "drake", partial(_drake, "world.sdf")),
+}
+"""Of each judge: the file of a scene that it reads, the module and the package that it needs, and its function."""
