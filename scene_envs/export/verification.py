@@ -98,25 +98,27 @@ def verify(path: str | os.PathLike[str]) -> Verification:
         count, digest, friction = (manifest[key] for key in ("scenes", "digest", "friction"))
     except (ValueError, KeyError, TypeError) as error:
         raise CorruptFileError(f"{str(root / 'export.json')!r} is no manifest of an export: {error}") from error
-    folders = sorted(folder for folder in root.glob("scene_[0-9]*") if folder.is_dir())
-    if len(folders) != count or not folders:
-        raise InvalidInputError(f"{str(root)!r} holds {len(folders)} of {count} scenes; export scenes into it first")
+    scenes = tuple(f"scene_{index:0{max(3, len(str(count - 1)))}d}" for index in range(count))
+    if not scenes:
+        raise InvalidInputError(f"{str(root)!r} holds no scenes; export at least one")
     findings: list[Finding] = []
     versions: dict[str, str] = {}
     missing: dict[str, str] = {}
     for judge, (file, module, package, judged) in JUDGES.items():
+        places = [(root / scene / file, root / f"{scene}{Path(file).suffix}") for scene in scenes]
+        paths = [path for two in places for path in two if path.is_file()]
         if find_spec(module) is None:
             missing[judge] = f"not installed: pip install {package}"
-        elif not all((folder / file).is_file() for folder in folders):
+        elif len(paths) < len(scenes):
             missing[judge] = f"no {file} in the export"
         elif file == _POSES and (friction != FRICTION or "randomization" in manifest):
             missing[judge] = "has other friction or masses than the files"
         else:
             versions[judge] = importlib.metadata.version(package.strip('"').partition("[")[0])
-            findings += [_find(judge, judged, root, folder) for folder in folders]
+            findings += [_find(scene, judge, judged, path) for scene, path in zip(scenes, paths, strict=True)]
     if not versions:
         raise InvalidInputError(f"{str(root)!r} has no file that can be judged here: {missing}")
-    report = Verification(tuple(folder.name for folder in folders), tuple(findings), versions, missing)
+    report = Verification(scenes, tuple(findings), versions, missing)
     rows = [vars(found) | {"largest": dict(zip(LIMITS, found.largest, strict=True))} for found in findings]
     verdict = {"digest": digest, "ready": all(report.ready), "ready_scenes": report.ready, "limits": LIMITS}
     write_json(root / "verify.json", verdict | vars(report) | {"findings": rows})
@@ -124,17 +126,18 @@ def verify(path: str | os.PathLike[str]) -> Verification:
     return report
 
 
-def _find(judge: str, judged: Callable[[Path, Path], Objects], root: Path, folder: Path) -> Finding:
-    started, faults, objects = time.perf_counter(), [], {"": [np.inf] * len(LIMITS)}
+def _find(scene: str, judge: str, judged: Callable[[Path], Objects], path: Path) -> Finding:
+    started, faults = time.perf_counter(), []
+    objects: Objects = {"": [np.inf] * len(LIMITS)}
     try:
-        objects = judged(root, folder)
+        objects = judged(path)
     except Exception as error:  # the simulator does not take the file, or gives up
         faults.append(" ".join(f"not simulated, {type(error).__name__}: {error}".split())[:400])
     for name, figures in objects.items() if not faults else ():
         over = [f"{key} {x:.2f}" for (key, most), x in zip(LIMITS.items(), figures, strict=True) if not x <= most]
         faults += [f"{name}: {', '.join(over)}"] if over else []
     largest = np.max([*objects.values(), [0.0] * len(LIMITS)], axis=0).tolist()
-    return Finding(folder.name, judge, tuple(largest), time.perf_counter() - started, tuple(faults))
+    return Finding(scene, judge, tuple(largest), time.perf_counter() - started, tuple(faults))
 
 
 def _objects(names: Sequence[str], depth: dict[str, float], poses: Callable[[float], ArrayLike]) -> Objects:
@@ -148,13 +151,13 @@ def _objects(names: Sequence[str], depth: dict[str, float], poses: Callable[[flo
     return dict(zip(names, (1e3 * figures).tolist(), strict=True))
 
 
-def _engine(physics: str, root: Path, folder: Path) -> Objects:
+def _engine(physics: str, path: Path) -> Objects:
     import torch
 
     from scene_envs.physics import equilibrium, penetration
     from scene_envs.scene import SceneBatch
 
-    found = np.load(folder / _POSES)
+    found = np.load(path)
     parts = [torch.from_numpy(found[key])[None] for key in ("translations", "rotations", "categories")]
     batch = SceneBatch.from_parts(parts[0].float(), parts[1].float(), parts[2], str(found["scene_type"]))
     overlap = penetration(batch, physics=physics)
@@ -165,14 +168,14 @@ def _engine(physics: str, root: Path, folder: Path) -> Objects:
     return dict(zip(found["names"].tolist(), (1e3 * figures).tolist(), strict=True))
 
 
-def _mujoco(root: Path, folder: Path) -> Objects:
+def _mujoco(path: Path) -> Objects:
     import mujoco
 
-    model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+    model = mujoco.MjModel.from_xml_path(str(path))
     return _simulated(model, [model.body(index).name for index in range(1, model.nbody)])
 
 
-def _newton(file: str, root: Path, folder: Path) -> Objects:
+def _newton(path: Path) -> Objects:
     """Newton's reading of a file, by its MuJoCo solver."""
     import newton
     import warp
@@ -182,7 +185,7 @@ def _newton(file: str, root: Path, folder: Path) -> Objects:
         warnings.simplefilter("ignore")
         builder = newton.ModelBuilder()
         newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
-        (builder.add_usd if file.endswith(".usda") else builder.add_mjcf)(str(folder / file))
+        (builder.add_usd if path.suffix == ".usda" else builder.add_mjcf)(str(path))
         solver = newton.solvers.SolverMuJoCo(builder.finalize(device="cpu"), use_mujoco_cpu=True)
     bodies = solver.mjc_body_to_newton.numpy()[0, 1:]
     return _simulated(solver.mj_model, [builder.body_label[body].rpartition("/")[2] for body in bodies])
@@ -211,17 +214,17 @@ def _simulated(model: Any, names: Sequence[str]) -> Objects:
     return _objects(names, depth, poses)
 
 
-def _pybullet(root: Path, folder: Path) -> Objects:
+def _pybullet(path: Path) -> Objects:
     import pybullet
     from pybullet_utils.bullet_client import BulletClient
     from scipy.spatial.transform import Rotation
 
     client, bodies, done = BulletClient(pybullet.DIRECT), {}, 0
     client.setGravity(0.0, 0.0, -GRAVITY)
-    for item in json.loads((folder / "objects.json").read_text())["objects"]:
-        path, turn = str(folder / item["bullet_urdf"]), np.roll(item["quaternion_wxyz"], -1).tolist()
+    for item in json.loads(path.read_text())["objects"]:
+        file, turn = str(path.parent / item["bullet_urdf"]), np.roll(item["quaternion_wxyz"], -1).tolist()
         flags = pybullet.URDF_USE_INERTIA_FROM_FILE
-        body = client.loadURDF(path, item["translation"], turn, useFixedBase=item["welded"], flags=flags)
+        body = client.loadURDF(file, item["translation"], turn, useFixedBase=item["welded"], flags=flags)
         bodies[item["name"]] = body, client.getDynamicsInfo(body, -1)[3:5]
     client.performCollisionDetection()
     contacts = {name: client.getContactPoints(bodyA=body) for name, (body, _) in bodies.items()}
@@ -242,7 +245,7 @@ def _pybullet(root: Path, folder: Path) -> Objects:
     return _objects(list(bodies), depth, poses)
 
 
-def _drake(file: str, root: Path, folder: Path) -> Objects:
+def _drake(path: Path) -> Objects:
     from pydrake.multibody.parsing import Parser
     from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
     from pydrake.systems.analysis import Simulator
@@ -252,9 +255,9 @@ def _drake(file: str, root: Path, folder: Path) -> Objects:
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=_DRAKE_STEP)
     parser = Parser(plant)
-    if file.endswith(".yaml"):
-        parser.package_map().AddPackageXml(str(root / "package.xml"))
-    models = parser.AddModels(str(folder / file))
+    if path.suffix == ".yaml":
+        parser.package_map().AddPackageXml(path.parents[1] / "package.xml")
+    models = parser.AddModels(path)
     plant.Finalize()
     diagram = builder.Build()
     simulator = Simulator(diagram)
@@ -279,14 +282,14 @@ def _drake(file: str, root: Path, folder: Path) -> Objects:
 
 
 _POSES, _NEWTON = "scene.npz", '"newton[sim,importers]"'
-JUDGES: dict[str, tuple[str, str, str, Callable[[Path, Path], Objects]]] = {
+JUDGES: dict[str, tuple[str, str, str, Callable[[Path], Objects]]] = {
     "bullet engine": (_POSES, "pybullet", "pybullet", partial(_engine, "bullet")),
     "mujoco engine": (_POSES, "mujoco", "mujoco", partial(_engine, "mujoco")),
     "MuJoCo, MJCF": ("scene.xml", "mujoco", "mujoco", _mujoco),
-    "Newton, MJCF": ("scene.xml", "newton", _NEWTON, partial(_newton, "scene.xml")),
-    "Newton, USD": ("scene.usda", "newton", _NEWTON, partial(_newton, "scene.usda")),
+    "Newton, MJCF": ("scene.xml", "newton", _NEWTON, _newton),
+    "Newton, USD": ("scene.usda", "newton", _NEWTON, _newton),
     "PyBullet, URDF": ("objects.json", "pybullet", "pybullet", _pybullet),
-    "Drake, directives": ("scene.dmd.yaml", "pydrake", "drake", partial(_drake, "scene.dmd.yaml")),
-    "Drake, SDF": ("world.sdf", "pydrake", "drake", partial(_drake, "world.sdf")),
+    "Drake, directives": ("scene.dmd.yaml", "pydrake", "drake", _drake),
+    "Drake, SDF": ("world.sdf", "pydrake", "drake", _drake),
 }
 """Of each judge: the file of a scene that it reads, the module and the package that it needs, and its function."""

@@ -74,7 +74,7 @@ def test_each_judge_reads_its_own_file(tmp_path):
 def test_overlaps_are_those_of_the_exact_depths(tmp_path):
     batch = jittered_scene(3)
     export(batch, tmp_path, "mjcf")
-    found = verification._mujoco(tmp_path, tmp_path / "scene_000")
+    found = verification._mujoco(tmp_path / "scene_000" / "scene.xml")
     depth = 1e3 * penetration(batch).depth[0]
     for thing in place(batch)[0].objects:
         assert found[thing.name][0] == pytest.approx(float(depth[thing.slot]), abs=0.01), thing.name
@@ -131,9 +131,8 @@ def test_wrong_input_is_named(tmp_path, capsys):
 def test_sample_exports_only_what_all_judges_find_ready(tmp_path, monkeypatch, capsys):
     judged = verification.JUDGES["mujoco engine"]
 
-    def second_falls(root, folder):
-        found = judged[3](root, folder)
-        return {name: [0.0, 0.0, 0.0, 7.0 if folder.name == "scene_001" else 0.0] for name in found}
+    def second_falls(path):
+        return {name: [0.0, 0.0, 0.0, 7.0 * ("scene_001" in str(path))] for name in judged[3](path)}
 
     monkeypatch.setattr(verification, "JUDGES", {"mujoco engine": (*judged[:3], second_falls)})
     prior = tiny_prior(slots=4).save(tmp_path / "prior")
