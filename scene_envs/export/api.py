@@ -75,10 +75,9 @@ def export(
     manifest = _claim(root, batch, friction)
     package = f"{identifier(batch.scene_type.name)}_{manifest['digest'][:8]}"
     files = AssetFiles(root / "assets", batch.scene_type.library.assets, friction, package)
-    digits = max(3, len(str(len(placed) - 1)))
     scenes = []
-    for scene in placed:
-        folder = root / f"scene_{scene.index:0{digits}d}"
+    for scene, name in zip(placed, scene_folders(len(placed)), strict=True):
+        folder = root / name
         folder.mkdir(exist_ok=True)
         scenes.append({name: write(scene, files, folder) for name, write in writers.items()})
     manifest["formats"] = sorted({*manifest["formats"], *names})
@@ -87,6 +86,21 @@ def export(
     folders = [root / "assets", *root.glob("scene_[0-9]*")]
     size = sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
     return ExportReport(root, names, tuple(scenes), used, size)
+
+
+def scene_folders(count: int) -> tuple[str, ...]:
+    """Names of the folders of so many scenes."""
+    return tuple(f"scene_{index:0{max(3, len(str(count - 1)))}d}" for index in range(count))
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The manifest of an export; raises CorruptFileError where it is none."""
+    try:
+        found = dict(json.loads(path.read_text()))
+        types = {"scene_type": str, "scenes": int, "friction": float, "digest": str, "formats": list}
+        return found | {key: kind(found[key]) for key, kind in types.items()}
+    except (ValueError, KeyError, TypeError) as error:
+        raise CorruptFileError(f"{str(path)!r} is no manifest of an export: {error}") from error
 
 
 def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
@@ -104,13 +118,8 @@ def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
     }
     path = root / MANIFEST
     if path.exists():
-        try:
-            found = dict(json.loads(path.read_text()))
-            same = all(found[key] == fresh[key] for key in ("scene_type", "scenes", "friction", "digest"))
-            found["formats"] = list(found["formats"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise CorruptFileError(f"{str(path)!r} is no manifest of an export: {error}") from error
-        if not same:
+        found = read_manifest(path)
+        if any(found[key] != fresh[key] for key in ("scene_type", "scenes", "friction", "digest")):
             raise InvalidInputError(
                 f"{str(root)!r} holds an export of other scenes ({found['scenes']} of {found['scene_type']!r}); "
                 "choose another output, or remove that folder"

@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.errors import InvalidInputError
+from scene_envs.export.api import MANIFEST, read_manifest, scene_folders
 from scene_envs.files import write_json, write_text
 from scene_envs.physics.parts import FRICTION, GRAVITY, angle_between
 
@@ -30,17 +31,14 @@ Objects = dict[str, Sequence[float]]
 """The figures of ``LIMITS`` for each object of a scene."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """What one judge finds in one scene: its largest figures, in the order of ``LIMITS``, its time (s), and a line for
-    each object beyond a limit, or for a file that the judge could not simulate.
-    """
+class Finding(NamedTuple):
+    """What one judge finds in one scene."""
 
     scene: str
     judge: str
-    largest: tuple[float, ...]
+    largest: dict[str, float]  # figures of LIMITS
     seconds: float
-    faults: tuple[str, ...]
+    faults: list[str]  # a line for each object beyond a limit, or for a file that could not be simulated
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class Verification:
         for judge, version in self.versions.items():
             found = [finding for finding in self.findings if finding.judge == judge]
             ready = f"{sum(not finding.faults for finding in found)} of {len(found)}"
-            figures = [*np.max([f.largest for f in found], axis=0), sum(f.seconds for f in found)]
+            figures = [*np.max([[*f.largest.values()] for f in found], axis=0), sum(f.seconds for f in found)]
             lines.append("".join([f"{judge:18}{version:10}{ready:10}", *(f"{figure:13.3f}" for figure in figures)]))
         lines += [f"not asked: {judge}, {reason}" for judge, reason in self.missing.items()]
         lines += [f"{found.scene}, {found.judge}: {fault}" for found in self.findings for fault in found.faults]
@@ -82,23 +80,15 @@ def verify(path: str | os.PathLike[str]) -> Verification:
 
     A scene is ready for a judge when no figure of an object is beyond ``LIMITS``; nothing is removed. Friction, masses
     and contact settings are those of the files; only the engines of :mod:`scene_envs.physics` have their own.
+    ``path`` is the folder of an export, or of a run that holds one in ``export/``.
 
-    Args:
-        path: Folder of an export, or of a run that holds one in ``export/``.
-
-    Raises:
-        InvalidInputError: the folder holds no scenes, or none of its files has a judge here.
-        CorruptFileError: ``export.json`` cannot be read.
+    Raises InvalidInputError for a folder without scenes or without a file that has a judge here, and CorruptFileError.
     """
-    root = next((p for p in (Path(path), Path(path, "export")) if (p / "export.json").is_file()), None)
+    root = next((p for p in (Path(path), Path(path, "export")) if (p / MANIFEST).is_file()), None)
     if root is None:
-        raise InvalidInputError(f"{str(path)!r} holds no export.json; name the folder of an export, as runs/mine")
-    try:
-        manifest = json.loads((root / "export.json").read_text())
-        count, digest, friction = (manifest[key] for key in ("scenes", "digest", "friction"))
-    except (ValueError, KeyError, TypeError) as error:
-        raise CorruptFileError(f"{str(root / 'export.json')!r} is no manifest of an export: {error}") from error
-    scenes = tuple(f"scene_{index:0{max(3, len(str(count - 1)))}d}" for index in range(count))
+        raise InvalidInputError(f"{str(path)!r} holds no {MANIFEST}; name the folder of an export, as runs/mine")
+    manifest = read_manifest(root / MANIFEST)
+    scenes = scene_folders(manifest["scenes"])
     if not scenes:
         raise InvalidInputError(f"{str(root)!r} holds no scenes; export at least one")
     findings: list[Finding] = []
@@ -111,7 +101,7 @@ def verify(path: str | os.PathLike[str]) -> Verification:
             missing[judge] = f"not installed: pip install {package}"
         elif len(paths) < len(scenes):
             missing[judge] = f"no {file} in the export"
-        elif file == _POSES and (friction != FRICTION or "randomization" in manifest):
+        elif file == _POSES and (manifest["friction"] != FRICTION or manifest.get("randomization")):
             missing[judge] = "has other friction or masses than the files"
         else:
             versions[judge] = importlib.metadata.version(package.strip('"').partition("[")[0])
@@ -119,8 +109,8 @@ def verify(path: str | os.PathLike[str]) -> Verification:
     if not versions:
         raise InvalidInputError(f"{str(root)!r} has no file that can be judged here: {missing}")
     report = Verification(scenes, tuple(findings), versions, missing)
-    rows = [vars(found) | {"largest": dict(zip(LIMITS, found.largest, strict=True))} for found in findings]
-    verdict = {"digest": digest, "ready": all(report.ready), "ready_scenes": report.ready, "limits": LIMITS}
+    verdict = {"digest": manifest["digest"], "ready": all(report.ready), "ready_scenes": report.ready, "limits": LIMITS}
+    rows = [found._asdict() for found in findings]
     write_json(root / "verify.json", verdict | vars(report) | {"findings": rows})
     write_text(root / "verify.txt", f"{report}\n")
     return report
@@ -128,16 +118,16 @@ def verify(path: str | os.PathLike[str]) -> Verification:
 
 def _find(scene: str, judge: str, judged: Callable[[Path], Objects], path: Path) -> Finding:
     started, faults = time.perf_counter(), []
-    objects: Objects = {"": [np.inf] * len(LIMITS)}
+    objects: Objects = {}
     try:
         objects = judged(path)
     except Exception as error:  # the simulator does not take the file, or gives up
         faults.append(" ".join(f"not simulated, {type(error).__name__}: {error}".split())[:400])
-    for name, figures in objects.items() if not faults else ():
+    for name, figures in objects.items():
         over = [f"{key} {x:.2f}" for (key, most), x in zip(LIMITS.items(), figures, strict=True) if not x <= most]
         faults += [f"{name}: {', '.join(over)}"] if over else []
     largest = np.max([*objects.values(), [0.0] * len(LIMITS)], axis=0).tolist()
-    return Finding(scene, judge, tuple(largest), time.perf_counter() - started, tuple(faults))
+    return Finding(scene, judge, dict(zip(LIMITS, largest, strict=True)), time.perf_counter() - started, faults)
 
 
 def _objects(names: Sequence[str], depth: dict[str, float], poses: Callable[[float], ArrayLike]) -> Objects:
@@ -246,21 +236,18 @@ def _pybullet(path: Path) -> Objects:
 
 
 def _drake(path: Path) -> Objects:
-    from pydrake.multibody.parsing import Parser
-    from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
-    from pydrake.systems.analysis import Simulator
-    from pydrake.systems.framework import DiagramBuilder
+    import pydrake.all as drake
 
     logging.getLogger("drake").setLevel(logging.ERROR)  # a line for each part of an SDF
-    builder = DiagramBuilder()
-    plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=_DRAKE_STEP)
-    parser = Parser(plant)
+    builder = drake.DiagramBuilder()
+    plant, _ = drake.AddMultibodyPlantSceneGraph(builder, time_step=_DRAKE_STEP)
+    parser = drake.Parser(plant)
     if path.suffix == ".yaml":
         parser.package_map().AddPackageXml(path.parents[1] / "package.xml")
     models = parser.AddModels(path)
     plant.Finalize()
     diagram = builder.Build()
-    simulator = Simulator(diagram)
+    simulator = drake.Simulator(diagram)
     context = plant.GetMyContextFromRoot(simulator.get_context())
     bodies = {plant.GetModelInstanceName(m): plant.get_body(plant.GetBodyIndices(m)[0]) for m in models}
     owner = {g: name for name, body in bodies.items() for g in plant.GetCollisionGeometriesForBody(body)}

@@ -1,4 +1,4 @@
-"""The commands of ``scene-envs``, imported when they are called: one module each; two that inpaint share one.
+"""The commands of ``scene-envs``, imported when they are called: one module each, or one for two that share its work.
 
 A command module has ``run(settings, run)``, which does the work. The annotation of ``settings`` is a dataclass; its
 fields are the keys of the command, each with a sentence under ``Attributes:``. A module with ``WRITES = False`` has no
@@ -31,7 +31,7 @@ COMMANDS = {
 }
 """Summaries of the commands, in the order of the listing."""
 
-_TOGETHER = {"complete": "inpaint", "rearrange": "inpaint"}
+_TOGETHER = {"complete": "inpaint", "rearrange": "inpaint", "verify": "export"}
 """Commands that are objects of a common module."""
 
 

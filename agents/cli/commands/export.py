@@ -1,4 +1,4 @@
-"""``scene-envs export``."""
+"""``scene-envs export`` and ``verify``."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.commands.scenes import draw, load_prior, make_ready
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import InvalidInputError, PhysicsError
 
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
@@ -21,6 +22,17 @@ if TYPE_CHECKING:
 
 _OVERLAP = 1e-3
 """Overlap (m) above which a simulator visibly pushes objects apart."""
+
+
+@dataclass
+class VerifyConfig:
+    """Exported scenes, judged by every engine and simulator that is installed.
+
+    Attributes:
+        path: folder of an export, or of a run that holds one in export/. It gets verify.json and verify.txt.
+    """
+
+    path: str = "."
 
 
 @dataclass
@@ -131,3 +143,16 @@ def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
     batch = draw(load_prior(settings), settings, 16 if settings.count is None else settings.count)
     batch.save(run.directory / "scenes.safetensors")
     return batch
+
+
+def run_verify(settings: VerifyConfig) -> None:
+    """Print the verdicts; raises PhysicsError when a judge finds a scene that is not ready."""
+    from scene_envs.export import verify
+
+    report = verify(settings.path)
+    print(report, flush=True)
+    if not all(report.ready):
+        raise PhysicsError(f"{report.ready.count(False)} of {len(report.scenes)} scenes are not ready for all judges")
+
+
+verify = SimpleNamespace(run=run_verify, WRITES=False, POSITIONAL=("path",))
