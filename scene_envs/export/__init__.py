@@ -8,13 +8,12 @@ if TYPE_CHECKING:
     from scene_envs.export.api import ExportReport, export
     from scene_envs.export.formats import ExportFormat, list_formats, register_format
     from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, place
-    from scene_envs.export.verification import Finding, Verification, verify
+    from scene_envs.export.verification import Verification, verify
 
 __all__ = [
     "AssetFiles",
     "ExportFormat",
     "ExportReport",
-    "Finding",
     "PlacedObject",
     "PlacedScene",
     "Verification",

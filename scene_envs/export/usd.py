@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,11 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
         prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
         if not item.welded:
             UsdPhysics.RigidBodyAPI.Apply(prim.GetPrim())
-            _apply_mass(prim.GetPrim(), item.asset)
+            _apply_mass(prim.GetPrim(), replace(item.asset, mass=item.mass, inertia=item.inertia))
+        if item.friction != files.friction:
+            surface = UsdPhysics.MaterialAPI.Apply(stage.OverridePrim(f"/World/{item.name}/surface"))
+            surface.CreateStaticFrictionAttr(item.friction)
+            surface.CreateDynamicFrictionAttr(item.friction)
     stage.GetRootLayer().Save()
     return path
 

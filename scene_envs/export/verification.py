@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.metadata
 import json
 import logging
 import os
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,8 +25,7 @@ from scene_envs.physics.parts import FRICTION, GRAVITY, angle_between
 
 LIMITS = {"overlap, mm": 1.0, "motion in 0.1 s, mm": 1.0, "rotation in 0.1 s, mrad": 10.0, "motion in 2 s, mm": 1.0}
 """The figures that a judge finds for each object, and what they are at most for an object that is ready."""
-_TIMES = (0.1, 2.0)
-_BULLET_RATE, _DRAKE_STEP = 240, 0.002  # steps a second, and s, which no file says
+_EARLY, _LATE = 0.1, 2.0
 Objects = dict[str, Sequence[float]]
 """The figures of ``LIMITS`` for each object of a scene."""
 
@@ -43,19 +42,12 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class Verification:
-    """Verdicts of all judges on an export.
-
-    Attributes:
-        scenes: Folders of the scenes, in order.
-        findings: One for each judge and scene.
-        versions: Version of the simulator of each judge.
-        missing: Judges that did not take part, with the line that installs them or another reason.
-    """
+    """Verdicts of all judges on the scenes of an export."""
 
     scenes: tuple[str, ...]
     findings: tuple[Finding, ...]
-    versions: dict[str, str]
-    missing: dict[str, str]
+    versions: dict[str, str]  # version of the simulator of each judge
+    missing: dict[str, str]  # judges that did not take part, with the line that installs them or another reason
 
     @property
     def ready(self) -> tuple[bool, ...]:
@@ -89,8 +81,6 @@ def verify(path: str | os.PathLike[str]) -> Verification:
         raise InvalidInputError(f"{str(path)!r} holds no {MANIFEST}; name the folder of an export, as runs/mine")
     manifest = read_manifest(root / MANIFEST)
     scenes = scene_folders(manifest["scenes"])
-    if not scenes:
-        raise InvalidInputError(f"{str(root)!r} holds no scenes; export at least one")
     findings: list[Finding] = []
     versions: dict[str, str] = {}
     missing: dict[str, str] = {}
@@ -106,12 +96,11 @@ def verify(path: str | os.PathLike[str]) -> Verification:
         else:
             versions[judge] = importlib.metadata.version(package.strip('"').partition("[")[0])
             findings += [_find(scene, judge, judged, path) for scene, path in zip(scenes, paths, strict=True)]
-    if not versions:
-        raise InvalidInputError(f"{str(root)!r} has no file that can be judged here: {missing}")
+    if not findings:
+        raise InvalidInputError(f"{str(root)!r} has no scene, or no file that can be judged here: {missing}")
     report = Verification(scenes, tuple(findings), versions, missing)
     verdict = {"digest": manifest["digest"], "ready": all(report.ready), "ready_scenes": report.ready, "limits": LIMITS}
-    rows = [found._asdict() for found in findings]
-    write_json(root / "verify.json", verdict | vars(report) | {"findings": rows})
+    write_json(root / "verify.json", verdict | vars(report) | {"findings": [found._asdict() for found in findings]})
     write_text(root / "verify.txt", f"{report}\n")
     return report
 
@@ -130,13 +119,11 @@ def _find(scene: str, judge: str, judged: Callable[[Path], Objects], path: Path)
     return Finding(scene, judge, dict(zip(LIMITS, largest, strict=True)), time.perf_counter() - started, faults)
 
 
-def _objects(names: Sequence[str], depth: dict[str, float], poses: Callable[[float], ArrayLike]) -> Objects:
-    """The figures of objects from their overlaps (m) and their poses (n, 7) after a time (s): translation (m) and
-    quaternion, in any order of its parts. Times are asked for in ascending order.
-    """
-    start, early, late = (np.array(poses(seconds), dtype=np.float64).reshape(-1, 7) for seconds in (0.0, *_TIMES))
+def _objects(names: Sequence[str], pairs: Sequence[tuple[str, float]], after: Callable[[float], ArrayLike]) -> Objects:
+    """The figures, from overlaps (m) and from poses (n, 7) after a further time (s): translation (m), quaternion."""
+    start, early, late = (np.array(after(x), dtype=float).reshape(-1, 7) for x in (0.0, _EARLY, _LATE - _EARLY))
     moved, drifted = (np.linalg.norm(rows[:, :3] - start[:, :3], axis=1) for rows in (early, late))
-    overlap = np.array([max(0.0, depth.get(name, 0.0)) for name in names])
+    overlap = [max((depth for other, depth in pairs if other == name and depth > 0), default=0.0) for name in names]
     figures = np.stack([overlap, moved, angle_between(early[:, 3:], start[:, 3:]), drifted], axis=1)
     return dict(zip(names, (1e3 * figures).tolist(), strict=True))
 
@@ -151,7 +138,7 @@ def _engine(physics: str, path: Path) -> Objects:
     parts = [torch.from_numpy(found[key])[None] for key in ("translations", "rotations", "categories")]
     batch = SceneBatch.from_parts(parts[0].float(), parts[1].float(), parts[2], str(found["scene_type"]))
     overlap = penetration(batch, physics=physics)
-    early, late = (equilibrium(batch, duration=seconds, physics=physics) for seconds in _TIMES)
+    early, late = (equilibrium(batch, duration=seconds, physics=physics) for seconds in (_EARLY, _LATE))
     if not (overlap.valid & early.valid & late.valid).all():
         raise InvalidInputError("objects overlap too deeply")
     figures = torch.cat([overlap.depth, early.displacement, early.rotation, late.displacement]).T
@@ -171,12 +158,10 @@ def _newton(path: Path) -> Objects:
     import warp
 
     warp.config.quiet = True
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        builder = newton.ModelBuilder()
-        newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
-        (builder.add_usd if path.suffix == ".usda" else builder.add_mjcf)(str(path))
-        solver = newton.solvers.SolverMuJoCo(builder.finalize(device="cpu"), use_mujoco_cpu=True)
+    builder = newton.ModelBuilder()
+    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    (builder.add_usd if path.suffix == ".usda" else builder.add_mjcf)(str(path))
+    solver = newton.solvers.SolverMuJoCo(builder.finalize(device="cpu"), use_mujoco_cpu=True)
     bodies = solver.mjc_body_to_newton.numpy()[0, 1:]
     return _simulated(solver.mj_model, [builder.body_label[body].rpartition("/")[2] for body in bodies])
 
@@ -185,54 +170,45 @@ def _simulated(model: Any, names: Sequence[str]) -> Objects:
     """A simulation by MuJoCo, of bodies with these names behind the world's."""
     import mujoco
 
-    data, flags, iterations = mujoco.MjData(model), model.opt.disableflags, model.opt.ccd_iterations
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD  # the distance of a single contact is a depth
-    model.opt.ccd_iterations = 200
-    mujoco.mj_forward(model, data)
-    depth: dict[str, float] = {}
-    for contact in data.contact:
-        for name in (["", *names][body] for body in model.geom_bodyid[contact.geom]):
-            depth[name] = max(depth.get(name, 0.0), -contact.dist)
-    model.opt.disableflags, model.opt.ccd_iterations = flags, iterations
-    mujoco.mj_resetData(model, data)
+    single = copy.copy(model)
+    single.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD  # the distance of a single contact is a depth
+    single.opt.ccd_iterations = 200
+    data = mujoco.MjData(single)
+    mujoco.mj_forward(single, data)
+    named = ["", *names]
+    pairs = [(named[body], -contact.dist) for contact in data.contact for body in single.geom_bodyid[contact.geom]]
+    data = mujoco.MjData(model)
 
-    def poses(seconds: float) -> ArrayLike:
-        mujoco.mj_step(model, data, round((seconds - data.time) / model.opt.timestep))
+    def after(seconds: float) -> ArrayLike:
+        mujoco.mj_step(model, data, round(seconds / model.opt.timestep))
         mujoco.mj_kinematics(model, data)
         return np.hstack([data.xpos[1:], data.xquat[1:]])
 
-    return _objects(names, depth, poses)
+    return _objects(names, pairs, after)
 
 
 def _pybullet(path: Path) -> Objects:
     import pybullet
     from pybullet_utils.bullet_client import BulletClient
-    from scipy.spatial.transform import Rotation
 
-    client, bodies, done = BulletClient(pybullet.DIRECT), {}, 0
+    client, bodies, pairs = BulletClient(pybullet.DIRECT), {}, []
     client.setGravity(0.0, 0.0, -GRAVITY)
     for item in json.loads(path.read_text())["objects"]:
         file, turn = str(path.parent / item["bullet_urdf"]), np.roll(item["quaternion_wxyz"], -1).tolist()
-        flags = pybullet.URDF_USE_INERTIA_FROM_FILE
-        body = client.loadURDF(file, item["translation"], turn, useFixedBase=item["welded"], flags=flags)
-        bodies[item["name"]] = body, client.getDynamicsInfo(body, -1)[3:5]
+        keys = {"useFixedBase": item["welded"], "flags": pybullet.URDF_USE_INERTIA_FROM_FILE}
+        body = client.loadURDF(file, item["translation"], turn, **keys)
+        bodies[item["name"]] = body, client.invertTransform(*client.getDynamicsInfo(body, -1)[3:5])
     client.performCollisionDetection()
-    contacts = {name: client.getContactPoints(bodyA=body) for name, (body, _) in bodies.items()}
-    depth = {name: max((-contact[8] for contact in rows), default=0.0) for name, rows in contacts.items()}
+    for name, (body, _) in bodies.items():
+        pairs += [(name, -contact[8]) for contact in client.getContactPoints(bodyA=body)]
 
-    def poses(seconds: float) -> ArrayLike:
-        nonlocal done
-        while done < round(_BULLET_RATE * seconds):
+    def after(seconds: float) -> ArrayLike:
+        for _ in range(round(240 * seconds)):
             client.stepSimulation()
-            done += 1
-        rows = []
-        for body, (center, axes) in bodies.values():  # PyBullet moves the principal frame of inertia
-            position, turn = client.getBasePositionAndOrientation(body)
-            rotation = Rotation.from_quat(turn) * Rotation.from_quat(axes).inv()
-            rows.append([*(position - rotation.apply(center)), *turn])
-        return rows
+        moved = [(*client.getBasePositionAndOrientation(body), *back) for body, back in bodies.values()]
+        return [np.concatenate(client.multiplyTransforms(*row)) for row in moved]  # it moves the frame of inertia
 
-    return _objects(list(bodies), depth, poses)
+    return _objects(list(bodies), pairs, after)
 
 
 def _drake(path: Path) -> Objects:
@@ -240,7 +216,7 @@ def _drake(path: Path) -> Objects:
 
     logging.getLogger("drake").setLevel(logging.ERROR)  # a line for each part of an SDF
     builder = drake.DiagramBuilder()
-    plant, _ = drake.AddMultibodyPlantSceneGraph(builder, time_step=_DRAKE_STEP)
+    plant, _ = drake.AddMultibodyPlantSceneGraph(builder, time_step=0.002)
     parser = drake.Parser(plant)
     if path.suffix == ".yaml":
         parser.package_map().AddPackageXml(path.parents[1] / "package.xml")
@@ -252,20 +228,15 @@ def _drake(path: Path) -> Objects:
     bodies = {plant.GetModelInstanceName(m): plant.get_body(plant.GetBodyIndices(m)[0]) for m in models}
     owner = {g: name for name, body in bodies.items() for g in plant.GetCollisionGeometriesForBody(body)}
     query = plant.get_geometry_query_input_port().Eval(context)
-    depth: dict[str, float] = {}
-    for pair in query.ComputePointPairPenetration():
-        value = pair.depth
-        if value > 1e-3:  # the search may end at a way out that is not the shortest; the other one fails on contacts
-            value = min(value, -query.ComputeSignedDistancePairClosestPoints(pair.id_A, pair.id_B).distance)
-        for name in (owner[pair.id_A], owner[pair.id_B]):
-            depth[name] = max(depth.get(name, 0.0), value)
+    found = query.ComputePointPairPenetration()
+    pairs = [(owner[part], pair.depth) for pair in found for part in (pair.id_A, pair.id_B)]
 
-    def poses(seconds: float) -> ArrayLike:
-        simulator.AdvanceTo(seconds)
+    def after(seconds: float) -> ArrayLike:
+        simulator.AdvanceTo(context.get_time() + seconds)
         found = [plant.EvalBodyPoseInWorld(context, body) for body in bodies.values()]
         return [[*pose.translation(), *pose.rotation().ToQuaternion().wxyz()] for pose in found]
 
-    return _objects(list(bodies), depth, poses)
+    return _objects(list(bodies), pairs, after)
 
 
 _POSES, _NEWTON = "scene.npz", '"newton[sim,importers]"'

@@ -120,7 +120,7 @@ def test_wrong_input_is_named(tmp_path, capsys):
     assert main(["verify", str(tmp_path)]) == 2
     assert "holds no export.json" in capsys.readouterr().err
     export(plate(), tmp_path, "glb")
-    with pytest.raises(InvalidInputError, match="no file that can be judged"):
+    with pytest.raises(InvalidInputError, match="or no file that can be judged"):
         verify(tmp_path)
     (tmp_path / "export.json").write_text("{}")
     assert main(["verify", str(tmp_path)]) == 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 import time
 from collections.abc import Sequence
@@ -48,6 +47,7 @@ class ExportConfig(DrawKeys):
         count: number of scenes; null for all of them, or 16 from a prior.
         project: make the scenes simulation-ready first (project out of penetration, then settle).
         friction: coefficient of friction of all surfaces.
+        randomization: YAML file with distributions of mass, friction and color; empty for none.
         workers: physics worker processes; 0 computes physics in this process.
         physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         output: folder for assets/ and scene_000/, scene_001/, ...
@@ -59,6 +59,7 @@ class ExportConfig(DrawKeys):
     count: int | None = None
     project: bool = False
     friction: float = 0.6
+    randomization: str = ""
     workers: int = 2
     physics: str = "auto"
     output: str = ""
@@ -67,6 +68,7 @@ class ExportConfig(DrawKeys):
 def check(settings: ExportConfig) -> None:
     """Refuse impossible settings before scenes are read."""
     from scene_envs.export.formats import check_formats
+    from scene_envs.export.randomization import read_randomization
 
     if bool(settings.scenes) == bool(settings.prior):
         raise InvalidInputError(
@@ -74,6 +76,7 @@ def check(settings: ExportConfig) -> None:
             "prior=dimsum_table"
         )
     check_formats(settings.formats)
+    read_randomization(settings.randomization)
 
 
 def run(settings: ExportConfig, run: Run) -> None:
@@ -84,24 +87,25 @@ def run(settings: ExportConfig, run: Run) -> None:
 
     formats = resolve_formats(settings.formats)
     batch = _scenes(settings, run)
+    keys = {"friction": settings.friction, "randomization": settings.randomization}
     metrics: dict[str, Any] = {}
     with make_pool(settings.workers, physics=settings.physics) as pool:
         if settings.project:
             metrics["ready"] = make_ready(batch, 0, pool, run)
             batch = SceneBatch.load(run.directory / "ready.safetensors")
-        metrics |= export_scenes(batch, formats, run.directory, pool, run, friction=settings.friction)
+        metrics |= export_scenes(batch, formats, run.directory, pool, run, **keys)
     run.write_metrics(metrics)
 
 
 def export_scenes(
-    batch: SceneBatch, formats: Sequence[str], output: Path, pool: PhysicsPool, run: Run, *, friction: float = 0.6
+    batch: SceneBatch, formats: Sequence[str], output: Path, pool: PhysicsPool, run: Run, **keys: Any
 ) -> dict[str, Any]:
     """Export into ``output``; say what was written and in how many scenes objects overlap; return the figures."""
     from scene_envs.export import export
     from scene_envs.physics import penetration
 
     started = time.perf_counter()
-    report = export(batch, output, formats, friction=friction)
+    report = export(batch, output, formats, **keys)
     seconds = time.perf_counter() - started
     size = f"{report.size / 1e6:.1f} MB"
     run.say(f"{len(batch)} scenes as {', '.join(report.formats)} in {output}: {size}, {seconds:.1f} s")
@@ -129,7 +133,7 @@ def keep_verified(batch: SceneBatch, formats: Sequence[str], run: Run, **keys: A
         export(batch, folder, [*formats, "npz"], **keys)
         report = verify(folder)
         for name in ("verify.json", "verify.txt"):
-            shutil.move(Path(folder, name), run.directory / name)
+            Path(folder, name).replace(run.directory / name)
     run.say(f"{report}; {report.ready.count(False)} dropped")
     return batch[[index for index, ready in enumerate(report.ready) if ready]]
 
