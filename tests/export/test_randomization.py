@@ -12,11 +12,14 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.export import export, place, verify
 from scene_envs.export.randomization import randomize, read_randomization
 from scene_envs.scene import SceneBatch
-from tests.export.test_export import content
 from tests.helpers.export_scenes import jittered_scene, laid_scene
 
 SETTINGS = {"seed": 3, "mass": {"uniform": [0.5, 2.0]}, "friction": {"triangular": [0.2, 0.5, 0.9]}}
 COLOR = {"color": {"normal": [0.9, 0.2]}}
+
+
+def content(folder) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def objects(folder) -> dict:
