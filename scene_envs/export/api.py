@@ -81,11 +81,13 @@ def export(
         folder = root / f"scene_{scene.index:0{digits}d}"
         folder.mkdir(exist_ok=True)
         scenes.append({name: write(scene, files, folder) for name, write in writers.items()})
+        if not any(folder.iterdir()):
+            folder.rmdir()
     manifest["formats"] = sorted({*manifest["formats"], *names})
     write_json(root / MANIFEST, manifest)
     used = tuple(dict.fromkeys(asset.name for scene in placed for asset in scene.assets))
-    folders = [root / "assets", *root.glob("scene_[0-9]*")]
-    size = sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
+    tops = [root / "assets", *root.glob("scene_[0-9]*")]
+    size = sum(path.stat().st_size for top in tops for path in (top, *top.rglob("*")) if path.is_file())
     return ExportReport(root, names, tuple(scenes), used, size)
 
 
