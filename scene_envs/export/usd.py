@@ -25,13 +25,11 @@ _SCENE = {
     "mjc:option:cone": ("token", "elliptic"),
     "mjc:option:impratio": ("double", 10.0),
     "mjc:option:integrator": ("token", "implicitfast"),
-    "mjc:option:timestep": ("double", TIMESTEP),
     "mjc:flag:multiccd": ("bool", True),
 }
 """Attributes of MjcSceneAPI; Newton reads the step from ``newton:timeStepsPerSecond``."""
 _CONTACT = {"mjc:solref": ("double[]", list(SOLREF)), "mjc:solimp": ("double[]", list(SOLIMP))}
 """Attributes of MjcCollisionAPI."""
-_QCODES = {
     "apple": "Q89", "board_game": "Q131436", "book": "Q571", "bottle": "Q80228", "bowl": "Q153988", "bread": "Q7802",
     "chair": "Q15026", "fork": "Q81881", "knife": "Q32489", "mug": "Q386215", "pear": "Q13099586", "plate": "Q57216",
     "spoon": "Q81895", "table": "Q14748", "teacup": "Q81707", "teapot": "Q245005", "teaspoon": "Q81895",
@@ -112,7 +110,7 @@ def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder:
         UsdPhysics.CollisionAPI.Apply(piece.GetPrim())
         UsdPhysics.MeshCollisionAPI.Apply(piece.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
         _apply(piece, "MjcCollisionAPI", _CONTACT)
-        _apply(piece, "NewtonMeshCollisionAPI", {})
+        _apply(piece, "NewtonMeshCollisionAPI", _GAP)
         binding = UsdShade.MaterialBindingAPI.Apply(piece.GetPrim())  # readers look on the collider itself, and
         binding.Bind(material)  # some of them read the binding for all purposes only
         binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
@@ -178,7 +176,6 @@ def _define_material(stage: Any, path: str, friction: float) -> Any:
     surface = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
     surface.CreateStaticFrictionAttr(friction)
     surface.CreateDynamicFrictionAttr(friction)
-    surface.CreateRestitutionAttr(0.0)
     return material
 
 
