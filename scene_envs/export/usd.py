@@ -30,6 +30,9 @@ _SCENE = {
 """Attributes of MjcSceneAPI; Newton reads the step from ``newton:timeStepsPerSecond``."""
 _CONTACT = {"mjc:solref": ("double[]", list(SOLREF)), "mjc:solimp": ("double[]", list(SOLIMP))}
 """Attributes of MjcCollisionAPI."""
+_GAP = {"newton:contactGap": ("float", 0.0)}
+"""Attribute of NewtonMeshCollisionAPI. Newton's default is 10 cm, which makes MuJoCo's solver throw stacks apart."""
+_QCODES = {
     "apple": "Q89", "board_game": "Q131436", "book": "Q571", "bottle": "Q80228", "bowl": "Q153988", "bread": "Q7802",
     "chair": "Q15026", "fork": "Q81881", "knife": "Q32489", "mug": "Q386215", "pear": "Q13099586", "plate": "Q57216",
     "spoon": "Q81895", "table": "Q14748", "teacup": "Q81707", "teapot": "Q245005", "teaspoon": "Q81895",
