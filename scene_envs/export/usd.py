@@ -46,7 +46,7 @@ _THUMBNAIL = 256
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene_000.usda`` beside the folder ``assets``, so that every reference stays below the file's own folder.
 
-    One prim under ``/World`` per object; welded ones have their rigid body disabled; metres, kilograms, z up.
+    One prim under ``/World`` per object; welded ones lose the asset's rigid body and stay colliders; metres, kilograms, z up.
     """
     from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics
 
@@ -67,8 +67,9 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
         body.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*item.translation.tolist()))
         w, x, y, z = item.quaternion.tolist()
         body.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
-        if item.welded and item.asset.mass > 0:
-            UsdPhysics.RigidBodyAPI(body).CreateRigidBodyEnabledAttr(False)
+        if item.welded:  # MuJoCo and Newton read rigidBodyEnabled=false as a free body
+            body.GetPrim().RemoveAPI(UsdPhysics.RigidBodyAPI)
+            body.GetPrim().RemoveAPI(UsdPhysics.MassAPI)
     stage.GetRootLayer().Save()
     return path
 
