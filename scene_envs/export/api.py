@@ -90,11 +90,13 @@ def export(
             values = {x.name: {"mass": x.mass, "friction": x.friction, "color": x.color} for x in scene.objects}
             write_json(folder / "randomization.json", {**settings, "verdict": "nominal", "objects": values})
         scenes.append({name: write(scene, files, folder) for name, write in writers.items()})
+        if not any(folder.iterdir()):
+            folder.rmdir()
     manifest["formats"] = sorted({*manifest["formats"], *names})
     write_json(root / MANIFEST, manifest)
     used = tuple(dict.fromkeys(asset.name for scene in placed for asset in scene.assets))
-    folders = [root / "assets", *root.glob("scene_[0-9]*")]
-    size = sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
+    tops = [root / "assets", *root.glob("scene_[0-9]*")]
+    size = sum(path.stat().st_size for top in tops for path in (top, *top.rglob("*")) if path.is_file())
     return ExportReport(root, names, tuple(scenes), used, size)
 
 
