@@ -50,16 +50,16 @@ def export(
 ) -> ExportReport:
     """Write scenes for simulators and viewers.
 
-    ``output`` gets ``assets/<asset>/`` (meshes, convex parts, URDF; written once and shared) and
-    ``scene_000/``, ``scene_001/``, … with one main file per format. All paths inside are relative, so the
-    folder can be moved. Poses are written in full double precision. More formats can be added to the same
+    ``output`` gets ``assets/<asset>/`` (meshes, convex parts, URDF; written once and shared) and ``scene_000/``,
+    ``scene_001/``, … with one main file per format; ``worlds`` has one for all scenes. All paths inside are relative,
+    so the folder can be moved. Poses are written in full double precision. More formats can be added to the same
     scenes by a second call; an interrupted export goes on when the same call is made again.
 
     Args:
         batch: B scenes. Their poses are not changed: make scenes simulation-ready first
             (:func:`scene_envs.physics.make_ready`) if they must stand still.
         output: Folder of the export; made if it does not exist. Other files in it are not touched.
-        formats: One or several names, or ``"all"`` for those that can be written here; see
+        formats: One or several names, or ``"all"`` for those with a file per scene that can be written here; see
             :func:`scene_envs.export.list_formats`.
         friction: Coulomb friction coefficient between any two surfaces; by default that of :mod:`scene_envs.physics`.
         randomization: Distributions of mass, friction and colour (:mod:`scene_envs.export.randomization`);
@@ -82,21 +82,24 @@ def export(
     manifest = _claim(root, batch, friction, settings)
     package = f"{identifier(batch.scene_type.name)}_{manifest['digest'][:8]}"
     files = AssetFiles(root / "assets", batch.scene_type.library.assets, friction, package)
+    whole = {name: write(placed, files, root) for name, write in writers.items() if _FORMATS[name].whole}
     scenes = []
-    for scene, name in zip(placed, scene_folders(len(placed)), strict=True):
-        folder = root / name
+    for scene, place_of in zip(placed, scene_folders(len(placed)), strict=True):
+        folder = root / place_of
         folder.mkdir(exist_ok=True)
         if settings:
             values = {x.name: {"mass": x.mass, "friction": x.friction, "color": x.color} for x in scene.objects}
             write_json(folder / "randomization.json", {**settings, "verdict": "nominal", "objects": values})
-        scenes.append({name: write(scene, files, folder) for name, write in writers.items()})
+        scenes.append({name: whole.get(name) or write(scene, files, folder) for name, write in writers.items()})
         if not any(folder.iterdir()):
             folder.rmdir()
     manifest["formats"] = sorted({*manifest["formats"], *names})
     write_json(root / MANIFEST, manifest)
     used = tuple(dict.fromkeys(asset.name for scene in placed for asset in scene.assets))
-    tops = [root / "assets", *root.glob("scene_[0-9]*")]
-    size = sum(path.stat().st_size for top in tops for path in (top, *top.rglob("*")) if path.is_file())
+    written = [
+        path for top in ("worlds.*", "assets/**/*", "scene_[0-9]*", "scene_[0-9]*/**/*") for path in root.glob(top)
+    ]
+    size = sum(path.stat().st_size for path in written if path.is_file())
     return ExportReport(root, names, tuple(scenes), used, size)
 
 
@@ -137,7 +140,7 @@ def _claim(root: Path, batch: SceneBatch, friction: float, randomization: Mappin
                 "choose another output, or remove that folder"
             )
         return found
-    taken = sorted(path.name for pattern in ("assets", "scene_[0-9]*") for path in root.glob(pattern))
+    taken = sorted(path.name for pattern in ("assets", "scene_[0-9]*", "worlds.*") for path in root.glob(pattern))
     if taken:
         raise InvalidInputError(
             f"{str(root)!r} already holds {taken[0]!r}, which no export wrote; choose an empty folder as output"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.registry import Registry
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 SceneWriter = Callable[["PlacedScene", "AssetFiles", Path], Path]
 """Function that writes one scene into its folder and assets into theirs, and returns the main file."""
+BatchWriter = Callable[[Sequence["PlacedScene"], "AssetFiles", Path], Path]
+"""Function that writes all scenes of an export into its folder and assets into theirs, and returns the main file."""
 
 ENTRY_POINT_GROUP = "scene_envs.export_formats"
 """Packages offer formats under this group: an entry named after the format, whose value is a SceneWriter."""
@@ -33,13 +35,15 @@ class ExportFormat:
         write: Writer, or its place as ``"module:function"``.
         requires: Module that the writer imports; empty for none.
         install: Package that holds this module.
+        whole: Whether the writer is a BatchWriter: it is called once, for all scenes.
     """
 
     name: str
     summary: str
-    write: SceneWriter | str
+    write: SceneWriter | BatchWriter | str
     requires: str = ""
     install: str = ""
+    whole: bool = False
 
     def check(self) -> None:
         """Raise MissingDependencyError where the module that the format requires is not installed."""
@@ -49,7 +53,7 @@ class ExportFormat:
                 f"install it with `pip install {self.install}`, or leave {self.name!r} out of formats="
             )
 
-    def writer(self) -> SceneWriter:
+    def writer(self) -> Any:
         """The writer, imported; raises MissingDependencyError where the required module is not installed."""
         self.check()
         if not isinstance(self.write, str):
@@ -66,6 +70,7 @@ _SHIPPED = (
     ExportFormat("usd", "USD with UsdPhysics", f"{_HERE}.usd:write_scene", "pxr", "usd-core"),
     ExportFormat("glb", "coloured mesh, no physics", f"{_HERE}.arrays:write_scene"),
     ExportFormat("npz", "numpy arrays", f"{_HERE}.arrays:write_npz"),
+    ExportFormat("worlds", "one MuJoCo model, a world per scene", f"{_HERE}.worlds:write_worlds", whole=True),
 )
 _FORMATS = Registry(
     "export format",
@@ -101,8 +106,9 @@ def list_formats() -> list[str]:
 
 
 def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
-    """Names of formats, each once, from one name, several, or ``"all"`` (those registered that can be written here).
-    Raises UnknownNameError, MissingDependencyError for a format without its package, and InvalidInputError for none.
+    """Names of formats, each once, from one name, several, or ``"all"`` (those with a file per scene that can be
+    written here). Raises UnknownNameError, MissingDependencyError for a format without its package, and
+    InvalidInputError for none.
 
     >>> resolve_formats(["mjcf", "npz", "mjcf"])
     ('mjcf', 'npz')
@@ -116,7 +122,8 @@ def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
 def check_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     """As :func:`resolve_formats`, without an import of the writers."""
     if formats == "all":
-        return tuple(f.name for f in _FORMATS.values() if not f.requires or find_spec(f.requires) is not None)
+        formats_here = (f for f in _FORMATS.values() if not f.requires or find_spec(f.requires) is not None)
+        return tuple(f.name for f in formats_here if not f.whole)
     if not isinstance(formats, Sequence) or not all(isinstance(name, str) for name in formats):
         raise InvalidInputError(f"formats={formats!r} is no list of names; known: {', '.join(list_formats())}")
     names = (formats,) if isinstance(formats, str) else tuple(dict.fromkeys(formats))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -17,7 +18,21 @@ from scene_envs.scene_types import Camera
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene.xml``: one body per object, with a free joint of the same name unless it is welded."""
-    root = ET.Element("mujoco", model=f"{scene.scene_type.name}_{scene.index}")
+    root, world = new_model(
+        f"{scene.scene_type.name}_{scene.index}", scene.scene_type.camera, scene.assets, files, folder
+    )
+    for item in scene.objects:
+        _add_body(world, item, files)
+    return write_xml(root, folder / "scene.xml")
+
+
+def new_model(
+    name: str, camera: Camera, assets: Iterable[Asset], files: AssetFiles, folder: Path
+) -> tuple[ET.Element, ET.Element]:
+    """A model without bodies for a file in ``folder``, and its world: settings, the classes ``visual`` and
+    ``collision`` of geometries, camera and light, and the meshes and materials of ``assets``.
+    """
+    root = ET.Element("mujoco", model=name)
     directory = relative(files.root, folder)
     ET.SubElement(root, "compiler", angle="radian", meshdir=directory, texturedir=directory)
     option = ET.SubElement(
@@ -33,12 +48,10 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     contact["gap"] = "0"  # Newton takes 0.1 m where a file says nothing, and stacks burst
     ET.SubElement(collision, "geom", {"type": "mesh", "group": "3", "mass": "0", **contact})
     shared, world = ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody")
-    _add_view(root, shared, world, scene.scene_type.camera)
-    for asset in scene.assets:
+    _add_view(root, shared, world, camera)
+    for asset in assets:
         _add_asset(shared, asset, files)
-    for item in scene.objects:
-        _add_body(world, item, files)
-    return write_xml(root, folder / "scene.xml")
+    return root, world
 
 
 def _add_asset(parent: ET.Element, asset: Asset, files: AssetFiles) -> None:
@@ -47,8 +60,9 @@ def _add_asset(parent: ET.Element, asset: Asset, files: AssetFiles) -> None:
     ET.SubElement(parent, "texture", name=name, type="2d", file=texture)
     ET.SubElement(parent, "material", name=name, texture=name, specular="0.2")
     ET.SubElement(parent, "mesh", name=f"{name}_visual", file=relative(visual, files.root), inertia="shell")
-    for part in files.parts(asset):
-        ET.SubElement(parent, "mesh", name=f"{name}_{part.stem}", file=relative(part, files.root))
+    for part in files.parts(asset):  # "convex": with the hull that contacts need, also where no geometry uses it
+        file = relative(part, files.root)
+        ET.SubElement(parent, "mesh", name=f"{name}_{part.stem}", file=file, inertia="convex")
 
 
 def _add_body(world: ET.Element, item: PlacedObject, files: AssetFiles) -> None:

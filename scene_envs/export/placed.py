@@ -113,7 +113,7 @@ def place(batch: SceneBatch, friction: float = FRICTION) -> list[PlacedScene]:
     batch = batch.to("cpu")
     require_rigid_poses(batch)
     scene_type, library = batch.scene_type, batch.scene_type.library
-    names = identifiers(library.names)
+    names, fixed = identifiers(library.names), scene_type.welded_categories
     translations = batch.translations.double().numpy()
     rotations = exact_rotations(batch.rotations.double().numpy())
     scenes = []
@@ -132,7 +132,7 @@ def place(batch: SceneBatch, friction: float = FRICTION) -> list[PlacedScene]:
                     category=category,
                     translation=translations[index, slot],
                     rotation=rotations[index, slot],
-                    welded=category in scene_type.welded_categories or asset.static or asset.mass <= 0,
+                    welded=category in fixed or asset.static or asset.mass <= 0,
                     mass=asset.mass,
                     inertia=asset.inertia,
                     friction=friction,
@@ -176,9 +176,9 @@ def exact_rotations(matrices: NDArray[np.floating]) -> Array:
 
 
 def quaternion(rotation: Array) -> Array:
-    """(4,) unit quaternion (w, x, y, z) of a rotation (3, 3), in double precision."""
-    x, y, z, w = quaternions(np.asarray(rotation, dtype=np.float64)[None])[0]
-    return np.copysign(1.0, w) * np.array([w, x, y, z])
+    """(..., 4) unit quaternions (w, x, y, z), w >= 0, of rotations (..., 3, 3), in double precision."""
+    found = np.roll(quaternions(np.asarray(rotation, dtype=np.float64).reshape(-1, 3, 3)), 1, axis=1)
+    return (np.copysign(1.0, found[:, :1]) * found).reshape(*np.shape(rotation)[:-2], 4)
 
 
 def angle_axis(rotation: Array) -> tuple[float, Array]:

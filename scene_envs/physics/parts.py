@@ -299,10 +299,9 @@ def angle_between(a: Array, b: Array) -> Array:
 
 
 def principal_inertia(inertia: Array) -> tuple[Array, Array]:
-    """Principal moments (3,) kg m^2, ascending, and the rotation (3, 3) from their axes to the asset's."""
+    """Principal moments (..., 3) kg m^2, ascending, and the rotation (..., 3, 3) from their axes to the asset's."""
     moments, axes = np.linalg.eigh(np.asarray(inertia, dtype=np.float64))
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1.0
+    axes[..., 0] *= np.copysign(1.0, np.linalg.det(axes))[..., None]
     return moments, axes
 
 

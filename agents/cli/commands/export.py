@@ -42,8 +42,8 @@ class ExportConfig(DrawKeys):
         scenes: a scene file, a folder of scene files, the folder of a sample or project run (its simulation-ready
             scenes if it has any), or a dataset.
         prior: a prior from which scenes are drawn, in place of scenes=: a shipped name or a folder.
-        formats: one or several of urdf, sdf, drake, mjcf, usd, glb, npz, written as [drake, mjcf]; all for
-            every format whose packages are installed.
+        formats: one or several of urdf, sdf, drake, mjcf, usd, glb, npz, worlds, written as [drake, mjcf]; all
+            for every format with a file per scene whose packages are installed.
         count: number of scenes; null for all of them, or 16 from a prior.
         project: make the scenes simulation-ready first (project out of penetration, then settle).
         friction: coefficient of friction of all surfaces.
