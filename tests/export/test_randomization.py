@@ -176,3 +176,12 @@ def test_the_command_takes_a_file(tmp_path, capsys):
     path.write_text("mass: heavy\n")
     assert main([*words, f"output={tmp_path / 'other'}"]) == 2
     assert "randomization=" in capsys.readouterr().err
+
+
+def test_worlds_hold_what_the_json_says(tmp_path):
+    export(laid_scene(), tmp_path, "worlds", randomization=SETTINGS)
+    found, drawn = np.load(tmp_path / "worlds.npz"), objects(tmp_path)
+    for body, name in enumerate(found["names"][0].tolist(), start=1):
+        if name in assets():
+            assert found["world/body_mass"][0, body] == pytest.approx(drawn[name]["mass"])
+    assert {row["friction"] for row in drawn.values()} == set(found["world/geom_friction"][0, :, 0].tolist())
