@@ -60,9 +60,8 @@ def _add_asset(parent: ET.Element, asset: Asset, files: AssetFiles) -> None:
     ET.SubElement(parent, "texture", name=name, type="2d", file=texture)
     ET.SubElement(parent, "material", name=name, texture=name, specular="0.2")
     ET.SubElement(parent, "mesh", name=f"{name}_visual", file=relative(visual, files.root), inertia="shell")
-    for part in files.parts(asset):  # "convex": with the hull that contacts need, also where no geometry uses it
-        file = relative(part, files.root)
-        ET.SubElement(parent, "mesh", name=f"{name}_{part.stem}", file=file, inertia="convex")
+    for part in files.parts(asset):
+        ET.SubElement(parent, "mesh", name=f"{name}_{part.stem}", file=relative(part, files.root))
 
 
 def _add_body(world: ET.Element, item: PlacedObject, files: AssetFiles) -> None:

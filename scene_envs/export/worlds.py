@@ -7,8 +7,8 @@ that differ. :func:`write_worlds` lists them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import zip_longest
+from dataclasses import dataclass, replace
+from itertools import cycle, zip_longest
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -26,6 +26,8 @@ from scene_envs.physics.parts import principal_inertia
 
 _NONE = 1e-9
 """Mass (kg), moments of inertia (kg m^2) and size (m) where there is no object; a size of 0 is that of a plane."""
+_APART = 50
+"""Distance of the bodies, m, in the model without the arrays."""
 _UNTURNED = (1.0, 0.0, 0.0, 0.0)
 _MOST = 1 << 28
 """Geometries of all worlds together above which the arrays do not fit into the memory of a GPU."""
@@ -37,12 +39,8 @@ class _Column:
 
     name: str
     welded: bool
+    parts: int  # places for convex parts
     objects: Sequence[PlacedObject | None]
-
-    @property
-    def parts(self) -> int:
-        """The most convex parts of an object."""
-        return max(len(item.asset.fine) for item in self.objects if item is not None)
 
 
 def write_worlds(scenes: Sequence[PlacedScene], files: AssetFiles, folder: Path) -> Path:
@@ -75,6 +73,9 @@ def write_worlds(scenes: Sequence[PlacedScene], files: AssetFiles, folder: Path)
         raise InvalidInputError(f"{len(scenes)} worlds have {count} geometries, more than {_MOST}: export fewer scenes")
     used = {item.category: item.asset for scene in scenes for item in scene.objects}
     assets = [used[category] for category in sorted(used)]
+    # MuJoCo makes hulls of the meshes that geometries which collide have in the model: each has a place in it
+    left = sum(len(asset.fine) for asset in assets) - sum(column.parts for column in columns)
+    columns[-1] = replace(columns[-1], parts=columns[-1].parts + max(0, left))
     path = write_xml(_model(scenes[0], columns, assets, files, folder), folder / "worlds.xml")
     arrays = _arrays(columns, _meshes(path), files)
     arrays["asset_names"] = np.array(scenes[0].scene_type.assets, dtype=str)
@@ -89,7 +90,9 @@ def _columns(scenes: Sequence[PlacedScene], *, welded: bool) -> list[_Column]:
     rows = [[item for item in scene.objects if item.welded is welded] for scene in scenes]
     ranked = [sorted(row, key=lambda item: (-len(item.asset.fine), item.category)) for row in rows]
     kind = "welded" if welded else "object"
-    return [_Column(f"{kind}_{rank}", welded, objects) for rank, objects in enumerate(zip_longest(*ranked))]
+    columns = list(zip_longest(*ranked))
+    most = [max(len(item.asset.fine) for item in objects if item is not None) for objects in columns]
+    return [_Column(f"{kind}_{rank}", welded, *column) for rank, column in enumerate(zip(most, columns, strict=True))]
 
 
 def _model(
@@ -97,9 +100,11 @@ def _model(
 ) -> ET.Element:
     """The model: a body for each column, with geometries for the picture and the most parts of its objects."""
     root, world = new_model(f"{scene.scene_type.name}_worlds", scene.scene_type.camera, assets, files, folder)
-    mesh, part = f"{files.name(assets[0])}_visual", f"{files.name(assets[0])}_{files.parts(assets[0])[0].stem}"
-    for column in columns:
-        body = ET.SubElement(world, "body", {"name": column.name, "gravcomp": "1"})
+    first = files.name(assets[0])
+    parts = cycle(f"{files.name(asset)}_{part.stem}" for asset in assets for part in files.parts(asset))
+    for index, column in enumerate(columns):  # far from each other: as compiled, no two bodies touch
+        place = f"{_APART * index} 0 {_APART}"
+        body = ET.SubElement(world, "body", {"name": column.name, "pos": place, "gravcomp": "1"})
         if column.welded:
             body.set("mocap", "true")
         else:
@@ -107,9 +112,9 @@ def _model(
             # another frame than the body's: MuJoCo must not compile in that both are the same
             inertial = {"pos": "0.1 0.2 0.3", "quat": "0.5 0.1 0.3 0.7"}
             ET.SubElement(body, "inertial", {**inertial, "mass": "1", "diaginertia": "1 1 1"})
-        ET.SubElement(body, "geom", {"class": "visual", "mesh": mesh, "material": files.name(assets[0])})
+        ET.SubElement(body, "geom", {"class": "visual", "mesh": f"{first}_visual", "material": first})
         for _ in range(column.parts):
-            ET.SubElement(body, "geom", {"class": "collision", "mesh": part})
+            ET.SubElement(body, "geom", {"class": "collision", "mesh": next(parts)})
     return root
 
 
