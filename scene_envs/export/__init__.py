@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from scene_envs.export.api import ExportReport, export
     from scene_envs.export.formats import ExportFormat, list_formats, register_format
     from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, place
+    from scene_envs.export.verification import Verification, verify
 
 __all__ = [
     "AssetFiles",
@@ -15,10 +16,12 @@ __all__ = [
     "ExportReport",
     "PlacedObject",
     "PlacedScene",
+    "Verification",
     "export",
     "list_formats",
     "place",
     "register_format",
+    "verify",
 ]
 
 __getattr__ = lazy_names(__name__, __file__)

@@ -13,6 +13,7 @@ from typing import Any
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.export.formats import _FORMATS, resolve_formats
 from scene_envs.export.placed import AssetFiles, identifier, place
+from scene_envs.export.randomization import randomize, read_randomization
 from scene_envs.files import write_json
 from scene_envs.physics.parts import FRICTION
 from scene_envs.scene import SceneBatch
@@ -45,6 +46,7 @@ def export(
     formats: str | Sequence[str] = "all",
     *,
     friction: float = FRICTION,
+    randomization: str | os.PathLike[str] | Mapping[str, Any] = "",
 ) -> ExportReport:
     """Write scenes for simulators and viewers.
 
@@ -60,6 +62,8 @@ def export(
         formats: One or several names, or ``"all"`` for those with a file per scene that can be written here; see
             :func:`scene_envs.export.list_formats`.
         friction: Coulomb friction coefficient between any two surfaces; by default that of :mod:`scene_envs.physics`.
+        randomization: Distributions of mass, friction and colour (:mod:`scene_envs.export.randomization`);
+            ``randomization.json`` of each scene says what its objects got.
 
     Raises:
         UnknownNameError: no such format.
@@ -70,28 +74,51 @@ def export(
         raise InvalidInputError(f"friction must be a finite number >= 0, got {friction}")
     names = resolve_formats(formats)
     writers = {name: _FORMATS[name].writer() for name in names}
-    placed = place(batch)
+    settings = read_randomization(randomization)
+    if "color" in settings and (plain := {*names} - {"mjcf", "npz"}):
+        raise InvalidInputError(f"only mjcf carries randomized colours: leave out color, or {', '.join(sorted(plain))}")
+    placed = [randomize(scene, settings) for scene in place(batch, friction)]
     root = Path(output)
-    manifest = _claim(root, batch, friction)
+    manifest = _claim(root, batch, friction, settings)
     package = f"{identifier(batch.scene_type.name)}_{manifest['digest'][:8]}"
     files = AssetFiles(root / "assets", batch.scene_type.library.assets, friction, package)
-    digits = max(3, len(str(len(placed) - 1)))
     whole = {name: write(placed, files, root) for name, write in writers.items() if _FORMATS[name].whole}
     scenes = []
-    for scene in placed:
-        folder = root / f"scene_{scene.index:0{digits}d}"
-        if len(whole) < len(names):
-            folder.mkdir(exist_ok=True)
+    for scene, place_of in zip(placed, scene_folders(len(placed)), strict=True):
+        folder = root / place_of
+        folder.mkdir(exist_ok=True)
+        if settings:
+            values = {x.name: {"mass": x.mass, "friction": x.friction, "color": x.color} for x in scene.objects}
+            write_json(folder / "randomization.json", {**settings, "verdict": "nominal", "objects": values})
         scenes.append({name: whole.get(name) or write(scene, files, folder) for name, write in writers.items()})
+        if not any(folder.iterdir()):
+            folder.rmdir()
     manifest["formats"] = sorted({*manifest["formats"], *names})
     write_json(root / MANIFEST, manifest)
     used = tuple(dict.fromkeys(asset.name for scene in placed for asset in scene.assets))
-    written = [*root.glob("worlds.*"), *root.glob("assets/**/*"), *root.glob("scene_[0-9]*/**/*")]
+    written = [
+        path for top in ("worlds.*", "assets/**/*", "scene_[0-9]*", "scene_[0-9]*/**/*") for path in root.glob(top)
+    ]
     size = sum(path.stat().st_size for path in written if path.is_file())
     return ExportReport(root, names, tuple(scenes), used, size)
 
 
-def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
+def scene_folders(count: int) -> tuple[str, ...]:
+    """Names of the folders of so many scenes."""
+    return tuple(f"scene_{index:0{max(3, len(str(count - 1)))}d}" for index in range(count))
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The manifest of an export; raises CorruptFileError where it is none."""
+    try:
+        found = dict(json.loads(path.read_text()))
+        types = {"scene_type": str, "scenes": int, "friction": float, "digest": str, "formats": list}
+        return found | {key: kind(found[key]) for key, kind in types.items()}
+    except (ValueError, KeyError, TypeError) as error:
+        raise CorruptFileError(f"{str(path)!r} is no manifest of an export: {error}") from error
+
+
+def _claim(root: Path, batch: SceneBatch, friction: float, randomization: Mapping[str, Any]) -> dict[str, Any]:
     """Claim the folder for this export; returns the manifest of an earlier export of the same scenes, or a new one."""
     try:
         root.mkdir(parents=True, exist_ok=True)
@@ -103,16 +130,11 @@ def _claim(root: Path, batch: SceneBatch, friction: float) -> dict[str, Any]:
         "friction": friction,
         "digest": _digest(batch),
         "formats": [],
-    }
+    } | ({"randomization": randomization} if randomization else {})
     path = root / MANIFEST
     if path.exists():
-        try:
-            found = dict(json.loads(path.read_text()))
-            same = all(found[key] == fresh[key] for key in ("scene_type", "scenes", "friction", "digest"))
-            found["formats"] = list(found["formats"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise CorruptFileError(f"{str(path)!r} is no manifest of an export: {error}") from error
-        if not same:
+        found = read_manifest(path)
+        if any(found.get(key) != fresh.get(key) for key in (*list(fresh)[:4], "randomization")):
             raise InvalidInputError(
                 f"{str(root)!r} holds an export of other scenes ({found['scenes']} of {found['scene_type']!r}); "
                 "choose another output, or remove that folder"

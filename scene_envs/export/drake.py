@@ -10,7 +10,7 @@ import yaml
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, angle_axis, number
-from scene_envs.export.urdf import asset_urdf, relative
+from scene_envs.export.urdf import object_urdf, relative
 from scene_envs.files import write_text
 
 
@@ -31,7 +31,7 @@ _Dumper.add_representer(float, lambda dumper, value: dumper.represent_scalar("ta
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene.dmd.yaml``; its package is the whole export, whose ``package.xml`` is written here too."""
     package = _write_package(files)
-    directives = [directive for item in scene.objects for directive in _directives(item, files, package)]
+    directives = [directive for item in scene.objects for directive in _directives(item, files, folder, package)]
     path = folder / "scene.dmd.yaml"
     text = yaml.dump({"directives": directives}, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=200)
     path.write_text(text)
@@ -57,9 +57,9 @@ def _write_package(files: AssetFiles) -> str:
     return files.package
 
 
-def _directives(item: PlacedObject, files: AssetFiles, package: str) -> list[dict[str, Any]]:
+def _directives(item: PlacedObject, files: AssetFiles, folder: Path, package: str) -> list[dict[str, Any]]:
     link = files.name(item.asset)
-    file = f"package://{package}/{relative(asset_urdf(item.asset, files), files.root.parent)}"
+    file = f"package://{package}/{relative(object_urdf(item, files, folder), files.root.parent)}"
     model: dict[str, Any] = {"name": item.name, "file": file}
     angle, axis = angle_axis(item.rotation)
     pose = {

@@ -45,6 +45,7 @@ def new_model(
     collision = ET.SubElement(defaults, "default", {"class": "collision"})
     contact = {"friction": f"{number(files.friction)} 0.005 0.0001", "solref": numbers(SOLREF)}
     contact["solimp"] = numbers(SOLIMP[:3])  # the others are MuJoCo's defaults
+    contact["gap"] = "0"  # Newton takes 0.1 m where a file says nothing, and stacks burst
     ET.SubElement(collision, "geom", {"type": "mesh", "group": "3", "mass": "0", **contact})
     shared, world = ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody")
     _add_view(root, shared, world, camera)
@@ -68,18 +69,20 @@ def _add_body(world: ET.Element, item: PlacedObject, files: AssetFiles) -> None:
     body = ET.SubElement(world, "body", name=item.name, pos=numbers(item.translation), quat=numbers(item.quaternion))
     if not item.welded:
         ET.SubElement(body, "freejoint", name=item.name)
-        moments, axes = principal_inertia(asset.inertia)
+        moments, axes = principal_inertia(item.inertia)
         ET.SubElement(
             body,
             "inertial",
             pos=numbers(asset.center_of_mass),
             quat=numbers(quaternion(axes)),
-            mass=number(asset.mass),
+            mass=number(item.mass),
             diaginertia=numbers(moments),
         )
-    ET.SubElement(body, "geom", {"class": "visual", "mesh": f"{name}_visual", "material": name})
+    tint = {} if min(item.color) == 1.0 else {"rgba": f"{numbers(item.color)} 1"}
+    ET.SubElement(body, "geom", {"class": "visual", "mesh": f"{name}_visual", "material": name, **tint})
+    own = {} if item.friction == files.friction else {"friction": f"{number(item.friction)} 0.005 0.0001"}
     for part in files.parts(asset):
-        ET.SubElement(body, "geom", {"class": "collision", "mesh": f"{name}_{part.stem}"})
+        ET.SubElement(body, "geom", {"class": "collision", "mesh": f"{name}_{part.stem}", **own})
 
 
 def _add_view(root: ET.Element, shared: ET.Element, world: ET.Element, camera: Camera) -> None:

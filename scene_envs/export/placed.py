@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scene_envs.arrays import Array
 from scene_envs.assets.base import Asset, ConvexPart
 from scene_envs.assets.shapes import convex_hull
-from scene_envs.physics.parts import quaternions
+from scene_envs.physics.parts import FRICTION, quaternions
 from scene_envs.scene_types import SceneType
 
 if TYPE_CHECKING:
@@ -40,6 +40,10 @@ class PlacedObject:
         translation: (3,) float64 m, world frame.
         rotation: (3, 3) float64, asset frame to world frame, orthonormal to machine precision.
         welded: Whether the object is fixed to the world.
+        mass: kg.
+        inertia: (3, 3) kg m^2 about the centre of mass, asset frame.
+        friction: Coefficient of friction.
+        color: Factors of red, green and blue, 0 to 1, on the colours of the asset.
     """
 
     name: str
@@ -49,6 +53,10 @@ class PlacedObject:
     translation: Array
     rotation: Array
     welded: bool
+    mass: float
+    inertia: Array
+    friction: float
+    color: tuple[float, ...] = (1.0, 1.0, 1.0)
 
     @cached_property
     def quaternion(self) -> Array:
@@ -86,8 +94,8 @@ class PlacedScene:
         return tuple(used[category] for category in sorted(used))
 
 
-def place(batch: SceneBatch) -> list[PlacedScene]:
-    """The scenes of a batch with exact poses and unique names.
+def place(batch: SceneBatch, friction: float = FRICTION) -> list[PlacedScene]:
+    """The scenes of a batch with exact poses, unique names, and the masses of the assets.
 
     Rotations in single precision become doubles on SO(3) that differ from the given ones by no more than their
     rounding. Objects are named after their asset and numbered in slot order. An asset without mass is welded.
@@ -125,6 +133,9 @@ def place(batch: SceneBatch) -> list[PlacedScene]:
                     translation=translations[index, slot],
                     rotation=rotations[index, slot],
                     welded=category in fixed or asset.static or asset.mass <= 0,
+                    mass=asset.mass,
+                    inertia=asset.inertia,
+                    friction=friction,
                 )
             )
             seen[category] += 1

@@ -35,24 +35,24 @@ def _add_model(world: ET.Element, item: PlacedObject, files: AssetFiles, folder:
     if item.welded:
         _text(model, "static", "true")
     link = ET.SubElement(model, "link", name=files.name(asset))
-    if asset.mass > 0:
+    if item.mass > 0:
         inertial = ET.SubElement(link, "inertial")
         _text(inertial, "pose", f"{numbers(asset.center_of_mass)} 0 0 0")
-        _text(inertial, "mass", number(asset.mass))
+        _text(inertial, "mass", number(item.mass))
         inertia = ET.SubElement(inertial, "inertia")
         for i, a in enumerate("xyz"):
             for j in range(i, 3):
-                _text(inertia, f"i{a}{'xyz'[j]}", number(asset.inertia[i, j]))
+                _text(inertia, f"i{a}{'xyz'[j]}", number(item.inertia[i, j]))
     visual = ET.SubElement(link, "visual", name="visual")
     _add_mesh(visual, files.visual(asset), folder)
     for part in files.parts(asset):
         collision = ET.SubElement(link, "collision", name=part.stem)
         ET.SubElement(_add_mesh(collision, part, folder), "drake:declare_convex")
         ode = ET.SubElement(ET.SubElement(ET.SubElement(collision, "surface"), "friction"), "ode")
-        _text(ode, "mu", number(files.friction))
-        _text(ode, "mu2", number(files.friction))
+        _text(ode, "mu", number(item.friction))
+        _text(ode, "mu2", number(item.friction))
         proximity = ET.SubElement(collision, "drake:proximity_properties")
-        for tag, value in drake_contact(asset, files.friction).items():
+        for tag, value in drake_contact(asset, item.friction).items():
             _text(proximity, f"drake:{tag}", "" if value is None else number(value))
 
 

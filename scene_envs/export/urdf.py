@@ -9,7 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from scene_envs.assets.base import Asset
-from scene_envs.export.placed import AssetFiles, PlacedScene, number, numbers
+from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, number, numbers
 
 BULLET_MARGIN = 1e-3
 """Bullet grows each convex mesh by this much (m); the parts of its URDF are smaller by as much."""
@@ -24,8 +24,8 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     objects = [
         {
             "name": item.name,
-            "urdf": relative(asset_urdf(item.asset, files), folder),
-            "bullet_urdf": relative(bullet_urdf(item.asset, files), folder),
+            "urdf": relative(object_urdf(item, files, folder), folder),
+            "bullet_urdf": relative(object_urdf(item, files, folder, "_bullet"), folder),
             "translation": item.translation.tolist(),
             "quaternion_wxyz": item.quaternion.tolist(),
             "welded": item.welded,
@@ -37,19 +37,16 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     return path
 
 
-def asset_urdf(asset: Asset, files: AssetFiles) -> Path:
-    """``<name>.urdf`` with exact parts, for everything but PyBullet. An asset without mass has mass 0 here."""
-    return files.once(
-        asset, "urdf", lambda folder: _write(asset, files, files.parts(asset), folder / f"{files.name(asset)}.urdf")
-    )
-
-
-def bullet_urdf(asset: Asset, files: AssetFiles) -> Path:
-    """``<name>_bullet.urdf``, whose parts act at their true size in PyBullet, which adds a margin to them."""
-    parts = files.inset_parts(asset, BULLET_MARGIN)
-    return files.once(
-        asset, "bullet", lambda folder: _write(asset, files, parts, folder / f"{files.name(asset)}_bullet.urdf")
-    )
+def object_urdf(item: PlacedObject, files: AssetFiles, folder: Path, kind: str = "") -> Path:
+    """``<name>.urdf`` with exact parts, or of kind ``_bullet``, with parts that have their true size in PyBullet,
+    which adds a margin. An object with mass or friction of its own has it in ``folder``. Mass may be 0 here.
+    """
+    asset = item.asset
+    parts = files.inset_parts(asset, BULLET_MARGIN) if kind else files.parts(asset)
+    if (item.mass, item.friction) != (asset.mass, files.friction):
+        return _write(item, files, parts, folder / f"{item.name}{kind}.urdf")
+    name = f"{files.name(asset)}{kind}.urdf"
+    return files.once(asset, f"urdf{kind}", lambda own: _write(item, files, parts, own / name))
 
 
 def drake_contact(asset: Asset, friction: float) -> dict[str, float | None]:
@@ -74,17 +71,17 @@ def write_xml(root: ET.Element, path: Path) -> Path:
     return path
 
 
-def _write(asset: Asset, files: AssetFiles, parts: list[Path], path: Path) -> Path:
-    name = files.name(asset)
+def _write(item: PlacedObject, files: AssetFiles, parts: list[Path], path: Path) -> Path:
+    asset, name = item.asset, files.name(item.asset)
     root = ET.Element("robot", {"name": name, "xmlns:drake": DRAKE})
     link = ET.SubElement(root, "link", name=name)
     contact = ET.SubElement(link, "contact")  # read by PyBullet, which multiplies the coefficients of the two bodies
-    ET.SubElement(contact, "lateral_friction", value=number(math.sqrt(files.friction)))
+    ET.SubElement(contact, "lateral_friction", value=number(math.sqrt(item.friction)))
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "origin", xyz=numbers(asset.center_of_mass), rpy="0 0 0")
-    ET.SubElement(inertial, "mass", value=number(asset.mass))
+    ET.SubElement(inertial, "mass", value=number(item.mass))
     moments = {
-        f"i{a}{b}": number(asset.inertia[i, j]) for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j
+        f"i{a}{b}": number(item.inertia[i, j]) for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j
     }
     ET.SubElement(inertial, "inertia", moments)
     visual = ET.SubElement(ET.SubElement(link, "visual"), "geometry")
@@ -94,6 +91,6 @@ def _write(asset: Asset, files: AssetFiles, parts: list[Path], path: Path) -> Pa
         mesh = ET.SubElement(ET.SubElement(collision, "geometry"), "mesh", filename=relative(part, path.parent))
         ET.SubElement(mesh, "drake:declare_convex")
         proximity = ET.SubElement(collision, "drake:proximity_properties")
-        for tag, value in drake_contact(asset, files.friction).items():
+        for tag, value in drake_contact(asset, item.friction).items():
             ET.SubElement(proximity, f"drake:{tag}", {} if value is None else {"value": number(value)})
     return write_xml(root, path)

@@ -1,7 +1,12 @@
-"""USD with UsdPhysics: one stage per scene, over one file per asset. Needs usd-core."""
+"""USD with UsdPhysics: one stage per scene, over one SimReady prop per asset. Needs usd-core.
+
+What a simulator must know beyond UsdPhysics stands in the applied schemas of MuJoCo and Newton, which usd-core writes
+without their packages: contact on each collider, step and friction cone on the physics scene.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,46 +14,88 @@ from typing import Any
 import numpy as np
 
 from scene_envs.arrays import Array
-from scene_envs.assets.base import Asset
+from scene_envs.assets.base import RECIPES, Asset
 from scene_envs.export.placed import AssetFiles, PlacedScene, face_colors, quaternion, visual_mesh
 from scene_envs.export.urdf import relative
+from scene_envs.physics.mujoco import SOLIMP, SOLREF, TIMESTEP
 from scene_envs.physics.parts import GRAVITY, principal_inertia
+from scene_envs.scene_types import Camera, SceneType
+
+_SCENE = {
+    "mjc:option:cone": ("token", "elliptic"),
+    "mjc:option:impratio": ("double", 10.0),
+    "mjc:option:integrator": ("token", "implicitfast"),
+    "mjc:flag:multiccd": ("bool", True),
+}
+"""Attributes of MjcSceneAPI; Newton reads the step from ``newton:timeStepsPerSecond``."""
+_CONTACT = {"mjc:solref": ("double[]", list(SOLREF)), "mjc:solimp": ("double[]", list(SOLIMP))}
+"""Attributes of MjcCollisionAPI."""
+_GAP = {"newton:contactGap": ("float", 0.0)}
+"""Attribute of NewtonMeshCollisionAPI. Newton's default is 10 cm, which makes MuJoCo's solver throw stacks apart."""
+_QCODES = {
+    "apple": "Q89", "board_game": "Q131436", "book": "Q571", "bottle": "Q80228", "bowl": "Q153988", "bread": "Q7802",
+    "chair": "Q15026", "fork": "Q81881", "knife": "Q32489", "mug": "Q386215", "pear": "Q13099586", "plate": "Q57216",
+    "spoon": "Q81895", "table": "Q14748", "teacup": "Q81707", "teapot": "Q245005", "teaspoon": "Q81895",
+}  # fmt: skip
+"""Wikidata items by a word of the asset's name."""
+_PHYSICAL_OBJECT = "Q223557"
+_THUMBNAIL = 256
+"""Width and height of an asset's picture, pixels."""
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
-    """``scene.usda``: one prim under ``/World`` per object, a rigid body unless it is welded; metres, z up."""
-    from pxr import Gf, Sdf, UsdGeom, UsdPhysics
+    """``scene_000.usda`` beside the folder ``assets``, so that every reference stays below the file's own folder.
 
-    path = folder / "scene.usda"
+    One prim under ``/World`` per object; welded ones lose the asset's rigid body and stay colliders; metres, kilograms, z up.
+    """
+    from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics
+
+    path = folder.with_suffix(".usda")
     stage = _new_stage(path)
     world = UsdGeom.Xform.Define(stage, "/World")
+    Usd.ModelAPI(world).SetKind(Kind.Tokens.assembly)
     stage.SetDefaultPrim(world.GetPrim())
     physics = UsdPhysics.Scene.Define(stage, "/World/physics_scene")
     physics.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
     physics.CreateGravityMagnitudeAttr(GRAVITY)
+    _apply(physics, "MjcSceneAPI", _SCENE)
+    _apply(physics, "NewtonSceneAPI", {"newton:timeStepsPerSecond": ("int", round(1.0 / TIMESTEP))})
     for item in scene.objects:
-        prim = UsdGeom.Xform.Define(stage, f"/World/{item.name}")
-        asset_file = files.once(item.asset, "usd", partial(_write_asset, item.asset, files))
-        prim.GetPrim().GetReferences().AddReference(Sdf.Reference(relative(asset_file, folder)))
-        prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*item.translation.tolist()))
+        body = UsdGeom.Xform.Define(stage, f"/World/{item.name}")
+        asset_file = files.once(item.asset, "usd", partial(_write_asset, item.asset, files, scene.scene_type))
+        body.GetPrim().GetReferences().AddReference(Sdf.Reference(f"./{relative(asset_file, path.parent)}"))
+        body.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*item.translation.tolist()))
         w, x, y, z = item.quaternion.tolist()
-        prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
-        if not item.welded:
-            UsdPhysics.RigidBodyAPI.Apply(prim.GetPrim())
-            _apply_mass(prim.GetPrim(), item.asset)
+        body.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
+        if item.welded:  # MuJoCo and Newton read rigidBodyEnabled=false as a free body
+            body.GetPrim().RemoveAPI(UsdPhysics.RigidBodyAPI)
+            body.GetPrim().RemoveAPI(UsdPhysics.MassAPI)
+        elif item.mass != item.asset.mass:
+            _apply_body(body.GetPrim(), replace(item.asset, mass=item.mass, inertia=item.inertia))
+        if item.friction != files.friction:
+            surface = UsdPhysics.MaterialAPI.Apply(stage.OverridePrim(f"/World/{item.name}/surface"))
+            surface.CreateStaticFrictionAttr(item.friction)
+            surface.CreateDynamicFrictionAttr(item.friction)
     stage.GetRootLayer().Save()
     return path
 
 
-def _write_asset(asset: Asset, files: AssetFiles, folder: Path) -> Path:
-    """``<name>.usda``: a coloured mesh, and convex colliders of purpose *guide*; the scene's file makes it a body."""
-    from pxr import Gf, Sdf, UsdGeom, UsdPhysics, UsdShade, Vt
+def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder: Path) -> Path:
+    """``usd/<name>.usda``: a rigid body of a coloured mesh and convex colliders of purpose *guide*, and its picture."""
+    from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
     name = files.name(asset)
-    path = folder / f"{name}.usda"
+    path = folder / "usd" / f"{name}.usda"
     stage = _new_stage(path)
     root = UsdGeom.Xform.Define(stage, f"/{name}")
     stage.SetDefaultPrim(root.GetPrim())
+    Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
+    code = next((_QCODES[word] for word in _QCODES if f"_{word}_" in f"_{asset.name}_"), _PHYSICAL_OBJECT)
+    _label(root, "class", asset.display_name)
+    _label(root, "wikidata_qcode", code)
+    if asset.mass > 0:
+        _apply_body(root.GetPrim(), asset)
+    material = _define_material(stage, f"/{name}/surface", files.friction)
     mesh = visual_mesh(asset)
     visual = _define_mesh(stage, f"/{name}/visual", mesh.vertices, mesh.faces)
     colors = face_colors(mesh) / 255.0
@@ -59,21 +106,27 @@ def _write_asset(asset: Asset, files: AssetFiles, folder: Path) -> Path:
     primvar.Set(Vt.Vec3fArray.FromNumpy(linear.astype(np.float32)))
     visual.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.asarray(mesh.vertex_normals, dtype=np.float32)))
     visual.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    material = UsdShade.Material.Define(stage, f"/{name}/surface")
-    surface = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
-    surface.CreateStaticFrictionAttr(files.friction)
-    surface.CreateDynamicFrictionAttr(files.friction)
-    surface.CreateRestitutionAttr(0.0)
+    UsdShade.MaterialBindingAPI.Apply(visual.GetPrim()).Bind(material)
     colliders = UsdGeom.Xform.Define(stage, f"/{name}/collision")
     colliders.CreatePurposeAttr(UsdGeom.Tokens.guide)
-    binding = UsdShade.MaterialBindingAPI.Apply(colliders.GetPrim())
-    binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
     for index, part in enumerate(asset.fine):
         piece = _define_mesh(stage, f"/{name}/collision/part_{index:02d}", part.vertices, part.faces)
+        corners = part.vertices[part.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        piece.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
+        piece.SetNormalsInterpolation(UsdGeom.Tokens.uniform)
+        piece.CreateDisplayColorAttr([Gf.Vec3f(0.4, 0.7, 0.4)])
         UsdPhysics.CollisionAPI.Apply(piece.GetPrim())
         UsdPhysics.MeshCollisionAPI.Apply(piece.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
-        piece.CreateDisplayColorAttr([Gf.Vec3f(0.4, 0.7, 0.4)])
+        _apply(piece, "MjcCollisionAPI", _CONTACT)
+        _apply(piece, "NewtonMeshCollisionAPI", _GAP)
+        binding = UsdShade.MaterialBindingAPI.Apply(piece.GetPrim())  # readers look on the collider itself, and
+        binding.Bind(material)  # some of them read the binding for all purposes only
+        binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
+    stage.GetRootLayer().customLayerData = _metadata(asset, code)
     stage.GetRootLayer().Save()
+    _write_thumbnail(asset, scene_type, path.parent / ".thumbs" / "256x256" / f"{path.name}.png")
     return path
 
 
@@ -85,6 +138,7 @@ def _new_stage(path: Path) -> Any:
     if layer:
         layer.Clear()
     else:
+        path.parent.mkdir(exist_ok=True)
         path.unlink(missing_ok=True)
         layer = Sdf.Layer.CreateNew(str(path))
     stage = Usd.Stage.Open(layer)
@@ -92,6 +146,47 @@ def _new_stage(path: Path) -> Any:
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
     return stage
+
+
+def _apply(schema: Any, name: str, attributes: dict[str, tuple[str, Any]]) -> None:
+    """Apply the API schema ``name``, whose package need not be installed; values (type, value) by attribute."""
+    from pxr import Sdf
+
+    prim = schema.GetPrim()
+    prim.AddAppliedSchema(name)
+    for key, (kind, value) in attributes.items():
+        prim.CreateAttribute(key, Sdf.ValueTypeNames.Find(kind), False, Sdf.VariabilityUniform).Set(value)
+
+
+def _label(schema: Any, taxonomy: str, label: str) -> None:
+    """UsdSemantics' label of one taxonomy, which the prims below inherit."""
+    from pxr import Sdf
+
+    schema.GetPrim().AddAppliedSchema(f"SemanticsLabelsAPI:{taxonomy}")
+    schema.GetPrim().CreateAttribute(f"semantics:labels:{taxonomy}", Sdf.ValueTypeNames.TokenArray, False).Set([label])
+
+
+def _define_material(stage: Any, path: str, friction: float) -> Any:
+    """A matt surface in the mesh's own colours, with the friction of contacts."""
+    from pxr import Gf, Sdf, UsdPhysics, UsdShade
+
+    material = UsdShade.Material.Define(stage, path)
+    _label(material, "material", "unspecified")
+    reader = UsdShade.Shader.Define(stage, f"{path}/colors")
+    reader.CreateIdAttr("UsdPrimvarReader_float3")
+    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
+    reader.CreateInput("fallback", Sdf.ValueTypeNames.Float3).Set(Gf.Vec3f(0.5, 0.5, 0.5))
+    shader = UsdShade.Shader.Define(stage, f"{path}/shader")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    color = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+    color.ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float3))
+    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.7)
+    shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
+    material.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    surface = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+    surface.CreateStaticFrictionAttr(friction)
+    surface.CreateDynamicFrictionAttr(friction)
+    return material
 
 
 def _define_mesh(stage: Any, path: str, vertices: Array, faces: Any) -> Any:
@@ -107,9 +202,11 @@ def _define_mesh(stage: Any, path: str, vertices: Array, faces: Any) -> Any:
     return mesh
 
 
-def _apply_mass(prim: Any, asset: Asset) -> None:
+def _apply_body(prim: Any, asset: Asset) -> None:
+    """A rigid body with the mass properties of the asset."""
     from pxr import Gf, UsdPhysics
 
+    UsdPhysics.RigidBodyAPI.Apply(prim)
     moments, axes = principal_inertia(asset.inertia)
     w, x, y, z = quaternion(axes).tolist()
     mass = UsdPhysics.MassAPI.Apply(prim)
@@ -117,3 +214,48 @@ def _apply_mass(prim: Any, asset: Asset) -> None:
     mass.CreateCenterOfMassAttr(Gf.Vec3f(*asset.center_of_mass.tolist()))
     mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*moments.tolist()))
     mass.CreatePrincipalAxesAttr(Gf.Quatf(w, x, y, z))
+
+
+def _metadata(asset: Asset, code: str) -> dict[str, Any]:
+    """SimReady's fields; the date is left open, so that the same export has the same bytes, and mass where it is 0."""
+    from pxr import Gf
+
+    extents = np.ptp(visual_mesh(asset).vertices, axis=0)
+    fields = {
+        "asset_name": asset.name,
+        "asset_type": "prop",
+        "category": asset.display_name,
+        "qcode": code,
+        "source_file": f"asset {asset.name!r} of scene_envs",
+        "author": "The SceneEnvs authors" if asset.name in RECIPES else "not stated",
+        "asset_license": "MIT" if asset.name in RECIPES else "not stated",
+        "usd_date_generated": "not stated",
+        "rigid_body_count": int(asset.mass > 0),
+        "asset_extents": Gf.Vec3f(*extents.tolist()),
+        "validation": {"profile": "Robotics-Prop", "profile_version": "4.0.0"},
+    }
+    if asset.mass > 0:
+        fields["mass"] = float(asset.mass)
+    outside = ("asset_name", "asset_type", "source_file", "usd_date_generated")  # rules look for these in both places
+    return {"SimReady_Metadata": fields} | {key: fields[key] for key in outside}
+
+
+def _write_thumbnail(asset: Asset, scene_type: SceneType, path: Path) -> None:
+    """A picture of the asset, by the project's own renderer."""
+    import torch
+    from PIL import Image
+
+    from scene_envs.render.pictures import render
+    from scene_envs.render.stage import fit_camera, frame_scene_type
+    from scene_envs.scene import SceneBatch
+
+    points = np.asarray(visual_mesh(asset).vertices, dtype=np.float64)
+    low, high = tuple(points.min(axis=0).tolist()), tuple(points.max(axis=0).tolist())
+    alone = replace(scene_type, slots=1, welded=(), fixed=(), workspace=(low, high))
+    position, target = fit_camera(points, frame_scene_type(alone).to_camera, 28.0, 1.0, 1.1)
+    x, y = tuple(position.tolist()), tuple(target.tolist())
+    camera = Camera(x, y, (0.0, 0.0, 1.0), _THUMBNAIL, _THUMBNAIL, 28.0)
+    category = torch.tensor([[scene_type.assets.index(asset.name)]])
+    batch = SceneBatch.from_parts(torch.zeros(1, 1, 3), torch.eye(3)[None, None], category, alone)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(render(batch, camera=camera)[0]).save(path)

@@ -173,10 +173,12 @@ def _arrays(columns: Sequence[_Column], meshes: tuple[dict[str, int], dict[str, 
         dataid[world, first[body - 1] : first[body - 1] + len(shapes[asset])] = shapes[asset]
     position = table(placed, [item.translation for _, _, item in placed], 0.0)
     turn = table(placed, quaternion(np.stack([item.rotation for _, _, item in placed])), _UNTURNED)
-    friction = table(placed, [files.friction for _ in placed], files.friction)[:, 1:].repeat(np.diff(first), axis=1)
-    mass = np.array([item.asset.mass for _, _, item in free])
+    friction = table(placed, [item.friction for _, _, item in placed], files.friction)[:, 1:].repeat(
+        np.diff(first), axis=1
+    )
+    mass = np.array([item.mass for _, _, item in free])
     center = np.array([item.asset.center_of_mass for _, _, item in free]).reshape(-1, 3)
-    moments, axes = principal_inertia(np.array([item.asset.inertia for _, _, item in free]).reshape(-1, 3, 3))
+    moments, axes = principal_inertia(np.array([item.inertia for _, _, item in free]).reshape(-1, 3, 3))
     weight = np.stack([1.0 / mass, (1.0 / moments).mean(axis=1)], axis=1)
     # a push at the origin of the body turns it as well: the mean over directions is tr([c]^T I^-1 [c]) / 3
     arm = np.cross(center[:, None], axes.swapaxes(1, 2))

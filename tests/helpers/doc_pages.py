@@ -168,6 +168,7 @@ PREPARED: dict[str, tuple[str, ...]] = {
 """Folders and files that a page speaks of without making them; each is made just before the block that names it."""
 
 YAML_FILES = {
+    "docs/export.md": "values.yaml",
     "docs/extending.md": "my_configs/algorithm/proximal.yaml",
     "docs/user_assets.md": "my_assets/library.yaml",
 }

@@ -20,6 +20,7 @@ COMMANDS = {
     "project": "make scenes simulation-ready: project out of penetration, then settle",
     "export": "write scenes for simulators and viewers: URDF, SDF, Drake, MJCF, USD, GLB, arrays",
     "render": "write images of cameras in scenes: color, depth, masks, normals, and annotations as those of COCO",
+    "verify": "judge exported scenes in every engine and simulator that is installed",
     "view": "write a page that shows scenes in a browser: a dataset, samples, a prior or a grammar",
     "evaluate": "measure the samples of a prior against real scenes",
     "priors": "list the shipped priors",
@@ -34,6 +35,7 @@ COMMANDS = {
 _TOGETHER = {
     "complete": "inpaint",
     "rearrange": "inpaint",
+    "verify": "export",
     "doctor": "post_train",
     "check-reward": "rewards",
     "package-prior": "priors",

@@ -1,17 +1,19 @@
-"""``scene-envs export``."""
+"""``scene-envs export`` and ``verify``."""
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any
 
 from agents.cli.commands.scenes import draw, load_prior, make_ready
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
-from scene_envs.errors import Count, InvalidInputError, Natural, at_least
+from scene_envs.errors import Count, InvalidInputError, Natural, PhysicsError, at_least
 
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
@@ -19,6 +21,17 @@ if TYPE_CHECKING:
 
 _OVERLAP = 1e-3
 """Overlap (m) above which a simulator visibly pushes objects apart."""
+
+
+@dataclass
+class VerifyConfig:
+    """Exported scenes, judged by every engine and simulator that is installed.
+
+    Attributes:
+        path: folder of an export, or of a run that holds one in export/. It gets verify.json and verify.txt.
+    """
+
+    path: str = "."
 
 
 @dataclass
@@ -34,6 +47,7 @@ class ExportConfig(DrawKeys):
         count: number of scenes; null for all of them, or 16 from a prior.
         project: make the scenes simulation-ready first (project out of penetration, then settle).
         friction: coefficient of friction of all surfaces.
+        randomization: YAML file with distributions of mass, friction and color; empty for none.
         workers: physics worker processes; 0 computes physics in this process.
         physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         output: folder for assets/ and scene_000/, scene_001/, ...
@@ -45,6 +59,7 @@ class ExportConfig(DrawKeys):
     count: Count | None = None
     project: bool = False
     friction: Annotated[float, at_least(0)] = 0.6
+    randomization: str = ""
     workers: Natural = 2
     physics: str = "auto"
     output: str = ""
@@ -53,6 +68,7 @@ class ExportConfig(DrawKeys):
 def check(settings: ExportConfig) -> None:
     """Refuse impossible settings before scenes are read."""
     from scene_envs.export.formats import check_formats
+    from scene_envs.export.randomization import read_randomization
 
     if bool(settings.scenes) == bool(settings.prior):
         raise InvalidInputError(
@@ -60,6 +76,7 @@ def check(settings: ExportConfig) -> None:
             "prior=dimsum_table"
         )
     check_formats(settings.formats)
+    read_randomization(settings.randomization)
 
 
 def run(settings: ExportConfig, run: Run) -> None:
@@ -70,24 +87,25 @@ def run(settings: ExportConfig, run: Run) -> None:
 
     formats = resolve_formats(settings.formats)
     batch = _scenes(settings, run)
+    keys = {"friction": settings.friction, "randomization": settings.randomization}
     metrics: dict[str, Any] = {}
     with make_pool(settings.workers, physics=settings.physics) as pool:
         if settings.project:
             metrics["ready"] = make_ready(batch, 0, pool, run)
             batch = SceneBatch.load(run.directory / "ready.safetensors")
-        metrics |= export_scenes(batch, formats, run.directory, pool, run, friction=settings.friction)
+        metrics |= export_scenes(batch, formats, run.directory, pool, run, **keys)
     run.write_metrics(metrics)
 
 
 def export_scenes(
-    batch: SceneBatch, formats: Sequence[str], output: Path, pool: PhysicsPool, run: Run, *, friction: float = 0.6
+    batch: SceneBatch, formats: Sequence[str], output: Path, pool: PhysicsPool, run: Run, **keys: Any
 ) -> dict[str, Any]:
     """Export into ``output``; say what was written and in how many scenes objects overlap; return the figures."""
     from scene_envs.export import export
     from scene_envs.physics import penetration
 
     started = time.perf_counter()
-    report = export(batch, output, formats, friction=friction)
+    report = export(batch, output, formats, **keys)
     seconds = time.perf_counter() - started
     size = f"{report.size / 1e6:.1f} MB"
     run.say(f"{len(batch)} scenes as {', '.join(report.formats)} in {output}: {size}, {seconds:.1f} s")
@@ -107,6 +125,19 @@ def export_scenes(
     }
 
 
+def keep_verified(batch: SceneBatch, formats: Sequence[str], run: Run, **keys: Any) -> SceneBatch:
+    """The scenes that all judges find ready in an export with these keys; the verdicts on all go into the run."""
+    from scene_envs.export import export, verify
+
+    with tempfile.TemporaryDirectory(dir=run.directory) as folder:
+        export(batch, folder, [*formats, "npz"], **keys)
+        report = verify(folder)
+        for name in ("verify.json", "verify.txt"):
+            Path(folder, name).replace(run.directory / name)
+    run.say(f"{report}; {report.ready.count(False)} dropped")
+    return batch[[index for index, ready in enumerate(report.ready) if ready]]
+
+
 def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
     """The scenes that ``scenes`` or ``prior`` names, at most ``count``."""
     if not settings.prior:
@@ -116,3 +147,16 @@ def _scenes(settings: ExportConfig, run: Run) -> SceneBatch:
     batch = draw(load_prior(settings), settings, 16 if settings.count is None else settings.count)
     batch.save(run.directory / "scenes.safetensors")
     return batch
+
+
+def run_verify(settings: VerifyConfig) -> None:
+    """Print the verdicts; raises PhysicsError when a judge finds a scene that is not ready."""
+    from scene_envs.export import verify
+
+    report = verify(settings.path)
+    print(report, flush=True)
+    if not all(report.ready):
+        raise PhysicsError(f"{report.ready.count(False)} of {len(report.scenes)} scenes are not ready for all judges")
+
+
+verify = SimpleNamespace(run=run_verify, WRITES=False, POSITIONAL=("path",))
