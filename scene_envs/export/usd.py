@@ -46,7 +46,7 @@ _THUMBNAIL = 256
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene_000.usda`` beside the folder ``assets``, so that every reference stays below the file's own folder.
 
-    One prim under ``/World`` per object; welded ones lose the asset's rigid body and stay colliders; metres, kilograms, z up.
+    One prim under ``/World`` per object; welded ones are colliders without a rigid body; units m and kg, z up.
     """
     from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics
 
