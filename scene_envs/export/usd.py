@@ -46,7 +46,7 @@ _THUMBNAIL = 256
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene_000.usda`` beside the folder ``assets``, so that every reference stays below the file's own folder.
 
-    One prim under ``/World`` per object; welded ones lose the asset's rigid body and stay colliders; metres, kilograms, z up.
+    One prim under ``/World`` per object; welded ones are colliders without a rigid body; units m and kg, z up.
     """
     from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics
 
@@ -252,7 +252,7 @@ def _write_thumbnail(asset: Asset, scene_type: SceneType, path: Path) -> None:
     points = np.asarray(visual_mesh(asset).vertices, dtype=np.float64)
     low, high = tuple(points.min(axis=0).tolist()), tuple(points.max(axis=0).tolist())
     alone = replace(scene_type, slots=1, welded=(), fixed=(), workspace=(low, high))
-    position, target = fit_camera(points, frame_scene_type(alone).to_camera, 28.0, 1.0, 1.1)
+    position, target = fit_camera(points, frame_scene_type(alone).to_camera, 28.0, 1.0, 0.06)
     x, y = tuple(position.tolist()), tuple(target.tolist())
     camera = Camera(x, y, (0.0, 0.0, 1.0), _THUMBNAIL, _THUMBNAIL, 28.0)
     category = torch.tensor([[scene_type.assets.index(asset.name)]])

@@ -255,7 +255,7 @@ def usd_stage(folder, index):
     pytest.importorskip("pxr")
     from pxr import Usd
 
-    return Usd.Stage.Open(str(path_of(folder, index, "scene.usda")))
+    return Usd.Stage.Open(str(folder / f"scene_{index:03d}.usda"))
 
 
 @SCENES
