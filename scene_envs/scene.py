@@ -150,6 +150,8 @@ class SceneBatch:
     @property
     def is_welded(self) -> Tensor:
         """(B, N) bool: slots that hold welded assets."""
+        from scene_envs.supports import welded_mask
+
         return constant_on(welded_mask(self.scene_type), self._tensor.device)[self.categories]
 
     @property
@@ -366,14 +368,6 @@ def require_rigid_poses(batch: SceneBatch) -> None:
                 f"scene {scene}, slot {slot} holds {what}: {batch.tensor[scene, slot, POSE].tolist()}; "
                 "SceneBatch.from_tensor turns the output of a sampler into valid poses"
             )
-
-
-@lru_cache(maxsize=32)
-def welded_mask(scene_type: SceneType) -> Tensor:
-    """(C + 1,) bool: assets that are welded, and False for empty slots."""
-    welded = torch.zeros(scene_type.num_assets + 1, dtype=torch.bool)
-    welded[list(scene_type.welded_categories)] = True
-    return welded
 
 
 def _require_scene_tensor(tensor: Tensor, scene_type: SceneType) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -12,7 +13,6 @@ from torch import Tensor
 
 from scene_envs.arrays import constant_on
 from scene_envs.assets.support_shapes import LibraryShapes, library_shapes
-from scene_envs.scene import welded_mask
 from scene_envs.scene_types import SceneType
 
 CONTACT = 0.01
@@ -28,6 +28,14 @@ _STEEPNESS = 20.0
 Column = TypeVar("Column", Tensor, NDArray[Any])
 _ANGLES = torch.arange(8, dtype=torch.float64) * math.pi / 4.0
 _DIRECTIONS = torch.stack([_ANGLES.cos(), _ANGLES.sin()], dim=1)  # (8, 2)
+
+
+@lru_cache(maxsize=32)
+def welded_mask(scene_type: SceneType) -> Tensor:
+    """(C + 1,) bool: assets that are welded, and False for empty slots."""
+    welded = torch.zeros(scene_type.num_assets + 1, dtype=torch.bool)
+    welded[list(scene_type.welded_categories)] = True
+    return welded
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,4 +57,4 @@ def test_a_run_says_its_reward_and_guard_at_its_first_and_last_iteration(monkeyp
             report(iteration, 1.5 * iteration, 1.02)
     first, last = stream.getvalue().splitlines()
     assert first.startswith("post-train tea 3/5  reward 4.5  guard 1.02x  ")
-    assert last == "post-train tea 5/5  reward 7.5  guard 1.02x  0 s left"
+    assert last == "post-train tea 5/5  reward 7.5  guard 1.02x  0 s to train"
