@@ -52,7 +52,8 @@ def content(folder) -> dict[str, bytes]:
 def test_each_scene_has_a_folder_and_assets_are_shared(folder, batch):
     names = {path.name for path in folder.iterdir()}
     assert names >= {"assets", "export.json", "package.xml", "scene_000", "scene_003"}
-    assert len([name for name in names if name.startswith("scene_")]) == len(batch)
+    assert len([path for path in folder.glob("scene_*") if path.is_dir()]) == len(batch)
+    assert len(list(folder.glob("scene_*.usda"))) == len(batch)
     used = {name for row in batch.names() for name in row}
     assert {path.name for path in (folder / "assets").iterdir()} == used
     expected = {"objects.json", "world.sdf", "scene.dmd.yaml", "scene.xml", "scene.glb", "scene.npz"}
