@@ -77,17 +77,19 @@ def shown(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Limit:
-    """Condition on the value of a field; ``rule`` ends the message of the InvalidInputError. None is accepted."""
+    """Condition on the value of a field; ``rule`` ends the message of the InvalidInputError. None is
+    accepted where the field's type says so.
+    """
 
     holds: Callable[[Any], bool]
     rule: str
 
-    def check(self, place: str, name: str, value: Any, default: Any) -> None:
-        """Raise unless it holds for the field ``name``, whose ``default`` says whether null is a choice."""
-        with suppress(TypeError):  # no number
-            if value is None or self.holds(value):
+    def check(self, place: str, name: str, value: Any, optional: bool) -> None:
+        """Raise unless it holds for the field ``name``, where null is a choice if it is ``optional``."""
+        with suppress(TypeError, OverflowError):  # no number, or one of thousands of digits
+            if (value is None and optional) or self.holds(value):
                 return
-        null = ", or null" if default is None else ""
+        null = ", or null" if optional else ""
         raise InvalidInputError(f"{place}{name}={shown(value)} {self.rule}{null}")
 
 
@@ -98,7 +100,7 @@ class OneOf:
     known: tuple[str, ...]
     what: str = ""
 
-    def check(self, place: str, name: str, value: Any, default: Any) -> None:
+    def check(self, place: str, name: str, value: Any, optional: bool) -> None:
         """Raise unless the word is known."""
         if value not in self.known:
             raise unknown_name(self.what or name, str(value), self.known)
@@ -111,7 +113,7 @@ def at_least(low: float) -> Limit:
 
 FINITE = Limit(math.isfinite, "must be a finite number")
 BELOW_ONE = Limit(lambda value: 0 <= value < 1, "must lie in [0, 1)")
-Positive = Annotated[float, Limit(lambda value: 0 < value < math.inf, "must be a positive number")]
+Positive = Annotated[float, Limit(lambda value: math.isfinite(value) and value > 0, "must be a positive number")]
 Count = Annotated[int, at_least(1)]
 Natural = Annotated[int, at_least(0)]
 Seed = Annotated[int, Limit(lambda seed: 0 <= seed < 2**63, "must be from 0 to 2^63 - 1")]
@@ -134,12 +136,17 @@ class Checked:
     """What stands in front of the name of a field in messages."""
 
     def __post_init__(self) -> None:
-        for name, condition in _conditions(type(self)):  # type: ignore[arg-type]
-            condition.check(self.place, name, getattr(self, name), getattr(type(self), name, ""))
+        for name, condition, optional in _conditions(type(self)):  # type: ignore[arg-type]
+            condition.check(self.place, name, getattr(self, name), optional)
 
 
 @cache
-def _conditions(kind: type) -> list[tuple[str, Limit | OneOf]]:
+def _conditions(kind: type) -> list[tuple[str, Limit | OneOf, bool]]:
+    """Name of the field, condition, and whether the field may be None."""
     hints = get_type_hints(kind, include_extras=True)
-    parts = [(name, part) for name, hint in hints.items() for part in (hint, *get_args(hint))]  # of a union, too
-    return [(name, condition) for name, part in parts for condition in getattr(part, "__metadata__", ())]
+    parts = [(name, hint, part) for name, hint in hints.items() for part in (hint, *get_args(hint))]  # of a union, too
+    return [
+        (name, condition, type(None) in get_args(hint))
+        for name, hint, part in parts
+        for condition in getattr(part, "__metadata__", ())
+    ]

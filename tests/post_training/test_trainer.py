@@ -329,7 +329,7 @@ def test_wrong_settings_are_named(tmp_path: Path, changes: dict) -> None:
 
 
 def test_prompt_match_without_a_prompt_ends_before_anything_is_sampled(tmp_path: Path) -> None:
-    with pytest.raises(TrainingError, match="'prompt_match' scored none of 2 real scenes"):
+    with pytest.raises(InvalidInputError, match="prompt_match has no prompt to compare with: give prompt="):
         post_train(small_config(tmp_path, reward="prompt_match"), prior=tiny_prior())
 
 
