@@ -137,12 +137,11 @@ class _Hand:
         for places in tips:
             for rotation, place in zip(frames, places, strict=True):
                 pose = Transform(rotation, place)
-                self.grasp.setTransform(pose)
-                if not own.meets(self.grasp):
-                    continue
-                for part in self.body:
+                for part in (self.grasp, *self.body):
                     part.setTransform(pose)
-                if not any(map(scene.meets, self.body)):
+                if any(map(scene.meets_last, self.body)):
+                    continue
+                if own.meets(self.grasp) and not any(map(scene.meets, self.body)):
                     return True
         return False
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from trimesh import creation
 
 from scene_envs.assets.base import ConvexPart
-from scene_envs.assets.fcl import Broadphase, Shapes, convex, gap
+from scene_envs.assets.fcl import YES_OR_NO, Broadphase, Shapes, convex, gap
 from scene_envs.assets.shapes import box
 from tests.helpers.import_graph import FILES
 
@@ -74,14 +74,25 @@ def test_a_scene_has_its_own_copy_of_each_part() -> None:
     assert before[1][0] is after[1][0]
 
 
-ALLOWED = {"BVHModel", "CollisionObject", "Convex", "DynamicAABBTreeCollisionManager", "Sphere", "Transform"}
+ALLOWED = {
+    "BVHModel",
+    "CollisionObject",
+    "CollisionRequest",
+    "CollisionResult",
+    "Convex",
+    "DynamicAABBTreeCollisionManager",
+    "Sphere",
+    "Transform",
+}
 """FCL's signed distance ends the process on some touching pairs; its contacts and its other solver are wrong there."""
 
 
 def test_only_calls_that_never_end_the_process_are_made() -> None:
-    """``fcl.collide`` and ``fcl.distance`` of two objects, without a request: contact as yes or no, unsigned distance.
-    Nothing else of FCL is used, under any name.
+    """``fcl.collide`` and ``fcl.distance`` of two objects, without a request or with the default one: contact as yes or
+    no, unsigned distance. Nothing else of FCL is used, under any name.
     """
+    assert not YES_OR_NO.enable_contact
+    assert YES_OR_NO.num_max_contacts == 1
     users = set()
     for name, file in FILES.items():
         tree = ast.parse(file.read_text(encoding="utf-8"))
@@ -96,5 +107,8 @@ def test_only_calls_that_never_end_the_process_are_made() -> None:
                 users.add(name)
                 if node.attr not in ALLOWED:
                     assert node.attr in ("collide", "distance"), (name, node.lineno)
-                    assert [len(called[node].args), called[node].keywords] == [2, []], (name, node.lineno)
+                    arguments = called[node].args
+                    default = [ast.unparse(argument) for argument in arguments[2:3]]
+                    assert called[node].keywords == [], (name, node.lineno)
+                    assert default == ([] if len(arguments) == 2 else ["YES_OR_NO"]), (name, node.lineno)
     assert users == {"scene_envs.assets.importing.solids", "scene_envs.assets.fcl", "scene_envs.physics.grasping"}
