@@ -63,10 +63,11 @@ def run_kernel(
     )
     chunks = [whole[start : start + size] for start in range(0, len(batch), size)]
     results = pool.run(kernel, chunks, options)
-    if lost := sum(row is not None and not row["valid"] for row in results):
+    if lost := [number for number, row in enumerate(results) if row is not None and not row["valid"]]:
         _LOGGER.debug(
-            "%s: %d of %d scenes are invalid: too deep in each other to be simulated or measured, or the simulation "
-            "diverged or took more work than a scene may, and was ended", kernel, lost, len(results),
+            "%s: %d of %d scenes of the batch are invalid (%s): too deep in each other to be simulated or measured, or "
+            "the simulation diverged or took more work than a scene may, and was ended; figures leave them out",
+            kernel, len(lost), len(results), ", ".join(map(str, lost[:10])) + ", ..." * (len(lost) > 10),
         )  # fmt: skip
     return results
 

@@ -158,8 +158,8 @@ def convex_parts(
         not piece.is_watertight and _depth(piece, _hull(piece.vertices, tolerance)) > tolerance for piece in bodies
     ):
         bodies = [surface]
-    elif len(pieces) > len(thick):
-        notes = [f"{what}: {len(pieces) - len(thick)} flat piece(s) left out of the collision parts"]
+    elif flat := sum(not has_volume(np.asarray(p.vertices)) and p.area > 1e-9 * surface.area for p in pieces):
+        notes = [f"{what}: {flat} flat piece(s) left out of the collision parts"]
     for body in bodies:
         seconds_left()
         hull = _hull(body.vertices, tolerance)
