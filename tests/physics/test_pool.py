@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -119,12 +120,21 @@ def test_workers_killed_between_two_calls_cost_nothing(
 @pytest.mark.slow
 @pytest.mark.usefixtures("copied_workers")
 def test_a_scene_that_fails_twice_is_invalid_and_the_others_are_not(
-    batch: SceneBatch, expected: FeasibilityResult
+    batch: SceneBatch, expected: FeasibilityResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Too short a time limit for anything, then a sufficient one: the pool recovers."""
+    from scene_envs.physics import kernels
+
+    real = kernels.KERNELS["feasibility"]
+
+    def slow(chunk: kernels.Chunk, **options: float) -> dict[str, object]:
+        time.sleep(0.2)
+        return real(chunk, **options)
+
+    monkeypatch.setitem(kernels.KERNELS, "feasibility", slow)
     with PhysicsPool(workers=1, timeout=60.0) as pool:
         feasibility(batch[:1], pool=pool)
-        pool.timeout = 1e-6
+        pool.timeout = 1e-3
         hopeless = feasibility(batch[:2], pool=pool)
         assert hopeless.valid.tolist() == [False, False]
         assert hopeless.counts.tolist() == [0, 0]
