@@ -68,6 +68,9 @@ _LABELS = {
     "invalid_scenes": "scenes whose simulation was ended",
 }
 """Labels of the measured figures on the page."""
+_MEASURING = 2.0
+"""Seconds of measuring a scene for the report, physics included, over those of a training step for as many denoiser
+evaluations; an estimate for the time left."""
 
 
 def post_train_and_compare(
@@ -99,7 +102,8 @@ def post_train_and_compare(
 
     started = time.perf_counter()
     base = cast(ScenePrior, resolve_prior(config.prior if prior is None else prior, config.device))
-    result = post_train(config, prior=base)
+    steps = 2 * scenes * num_steps / (config.batch_size * config.num_steps)
+    result = post_train(config, prior=base, after=_MEASURING * steps)
     if not ProcessGroup.current().is_first:
         return result.metrics
     trained = time.perf_counter()

@@ -145,16 +145,19 @@ def _smooth(values: np.ndarray, half: int = 4) -> np.ndarray:
 
 
 @contextmanager
-def run_progress(title: str, total: int, style: str, done: int = 0) -> Iterator[Callable[[int, float, float], None]]:
+def run_progress(
+    title: str, total: int, style: str, done: int = 0, after: float = 0.0
+) -> Iterator[Callable[[int, float, float], None]]:
     """Show the progress of a run; yields the function that advances it, which takes the number of iterations done, the
     last batch's mean reward, and the held-out loss divided by the base prior's. ``style`` is ``"bar"`` (lines when
     stderr is no terminal), ``"lines"`` (after the first iteration, every 5 s and at the end) or ``"none"``.
+    The time left includes work ``after`` the run that takes as long as so many iterations.
     """
     with Progress(title, total, done=done, style=style, every=5.0, always=(done + 1, total)) as progress:
 
         def update(iteration: int, reward: float, guard: float) -> None:
-            left = progress.seconds / max(1, iteration - done) * (total - iteration)
-            line = f"{title} {iteration}/{total}  reward {reward:.3g}  guard {guard:.2f}x  {left:.0f} s to train"
+            left = progress.seconds / max(1, iteration - done) * (total - iteration + after)
+            line = f"{title} {iteration}/{total}  reward {reward:.3g}  guard {guard:.2f}x  {left:.0f} s left"
             progress.update(iteration, f"reward [green]{reward:.3g}[/]  guard [yellow]{guard:.2f}x[/]", line)
 
         yield update

@@ -80,7 +80,7 @@ class PostTrainResult:
     config: PostTrainConfig
 
 
-def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> PostTrainResult:
+def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None, after: float = 0.0) -> PostTrainResult:
     """Post-train a prior with regularisation on real scenes; resumes a run found in ``config.output``.
 
     Processes that ``torchrun`` started share each batch and take the same steps as a single process. Only the first
@@ -89,6 +89,7 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     Args:
         config: configuration of the run.
         prior: prior to start from, instead of the one that ``config.prior`` names; it is not changed.
+        after: work of the caller that follows, in iterations; the time left that is shown includes it.
 
     Raises:
         TrainingError: a gradient or a value of the prior is not finite, no reward was valid for too long, the disk is
@@ -117,7 +118,7 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None) -> P
     processes = ProcessGroup.join(str(resolve_device(config.device, None if prior is None else prior.device)))
     claim = claimed(config.directory, "post_train") if processes.is_first else nullcontext()
     with claim, closing(PostTrainer(config, prior=prior)) as trainer:
-        return trainer.run()
+        return trainer.run(after)
 
 
 class PostTrainer:
@@ -158,8 +159,10 @@ class PostTrainer:
 
     # -- the loop -------------------------------------------------------------------------------
 
-    def run(self) -> PostTrainResult:
-        """Train until ``config.iterations``, or until the guard stops the run; the result holds the best prior."""
+    def run(self, after: float = 0.0) -> PostTrainResult:
+        """Train until ``config.iterations``, or until the guard stops the run; the result holds the best prior. Work
+        ``after`` the run, in iterations, counts in the time left that is shown.
+        """
         config = self.config
         state = load_resumable(self.directory, self.plain)
         self.prepare(reuse_scenes=state is not None)
@@ -176,7 +179,7 @@ class PostTrainer:
         self._write_log()  # removes the rows of an earlier run, or rows beyond the checkpoint
         style = config.progress if self.processes.is_first else "none"
         with (
-            run_progress(title, config.iterations, style, self.iteration) as report,
+            run_progress(title, config.iterations, style, self.iteration, after) as report,
             finishing_steps() as end,
         ):
             while self.iteration < config.iterations and not self._stopped:

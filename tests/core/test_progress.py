@@ -57,4 +57,15 @@ def test_a_run_says_its_reward_and_guard_at_its_first_and_last_iteration(monkeyp
             report(iteration, 1.5 * iteration, 1.02)
     first, last = stream.getvalue().splitlines()
     assert first.startswith("post-train tea 3/5  reward 4.5  guard 1.02x  ")
-    assert last == "post-train tea 5/5  reward 7.5  guard 1.02x  0 s to train"
+    assert last == "post-train tea 5/5  reward 7.5  guard 1.02x  0 s left"
+
+
+def test_the_time_left_of_a_run_includes_the_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with run_progress("post-train tea", 2, "lines", after=6.0) as report:
+        monkeypatch.setattr(Progress, "seconds", 10.0)
+        report(1, 1.0, 1.0)
+        report(2, 1.0, 1.0)
+    left = [line.rsplit("  ", 1)[1] for line in stream.getvalue().splitlines()]
+    assert left == ["70 s left", "30 s left"]  # 10 s an iteration, then 5 s: one more and six, then six
