@@ -337,17 +337,22 @@ def test_scenes_are_completed_in_parts(
     torch.testing.assert_close(parts, whole, rtol=0, atol=1e-5)
 
 
+def short_search(folder: Path, *words: str) -> dict:
+    """The metrics of a search for six scenes of an untrained prior."""
+    prior = tiny_prior("dimsum_table", process="mixed", slots=6).save(folder / "prior")
+    short = ["objective=object_count", "planner=greedy", "budget=6", "branching=2", "num_steps=2", "slots=6"]
+    assert main(["search", f"prior={prior}", *short, *words, f"output={folder / 'found'}"]) == 0
+    return metrics(folder / "found")
+
+
 @pytest.mark.slow
 def test_search_and_baseline_have_a_last_line_with_the_scenes_and_evaluations(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    prior = tiny_prior("dimsum_table", process="mixed", slots=6).save(tmp_path / "prior")
-    words = ["objective=object_count", "planner=greedy", "budget=6", "branching=2", "num_steps=2", "slots=6"]
-    assert main(["search", f"prior={prior}", *words, f"output={tmp_path / 'found'}"]) == 0
+    found = short_search(tmp_path)  # progress and result have one unit: the objective
     lines = [line for line in capsys.readouterr().err.splitlines() if " scenes, best " in line]
     assert [line.split(":")[0] for line in lines] == ["search", "best of N"]
     assert all(line.endswith("12 NFE") for line in lines)
-    found = metrics(tmp_path / "found")  # progress and result have one unit: the objective
     told = [float(line.split("best ")[-1].split(",")[0]) for line in lines]
     assert told == [found["search"]["objective"], found["best_of"]["objective"]]
     assert max(told) > 1
@@ -357,11 +362,8 @@ def test_search_and_baseline_have_a_last_line_with_the_scenes_and_evaluations(
 def test_a_baseline_that_would_take_longer_than_the_limit_is_left_out_and_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    prior = tiny_prior("dimsum_table", process="mixed", slots=6).save(tmp_path / "prior")
-    words = ["objective=object_count", "planner=greedy", "budget=6", "branching=2", "num_steps=2", "max_seconds=1e-6"]
-    assert main(["search", f"prior={prior}", *words, f"output={tmp_path / 'found'}"]) == 0
+    assert "best_of" not in short_search(tmp_path, "max_seconds=1e-6")
     assert "the baseline, as many independent samples, is left out" in capsys.readouterr().out
-    assert "best_of" not in metrics(tmp_path / "found")
 
 
 @pytest.mark.parametrize("command", ["sample reward", "search objective", "post-train reward", "doctor reward"])
