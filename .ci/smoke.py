@@ -151,9 +151,12 @@ def check_exports() -> str:
     chunk = _chunk(("teacup", 0.3, 0.0, 0.0), ("teapot", -0.2, 0.1, 0.0))
     table = chunk.scene_type
     objects = tuple(
-        PlacedObject(f"object_{slot}", table.library[category], slot, category, place, np.eye(3), slot == 0)
+        PlacedObject(
+            f"object_{slot}", asset := table.library[category], slot, category, place, np.eye(3), slot == 0,
+            asset.mass, asset.inertia, 0.6,
+        )
         for slot, (category, place) in enumerate(zip(chunk.categories[0].tolist(), chunk.translations[0], strict=True))
-    )
+    )  # fmt: skip
     scene = PlacedScene(0, table, len(objects), objects)
     with tempfile.TemporaryDirectory() as folder:
         files = AssetFiles(Path(folder) / "assets", scene.assets, 0.6, "smoke")

@@ -19,7 +19,7 @@ from scene_envs.export.placed import AssetFiles, PlacedScene, face_colors, quate
 from scene_envs.export.urdf import relative
 from scene_envs.physics.mujoco import SOLIMP, SOLREF, TIMESTEP
 from scene_envs.physics.parts import GRAVITY, principal_inertia
-from scene_envs.scene_types import Camera, SceneType
+from scene_envs.scene_types import SceneType
 
 _SCENE = {
     "mjc:option:cone": ("token", "elliptic"),
@@ -242,20 +242,19 @@ def _metadata(asset: Asset, code: str) -> dict[str, Any]:
 
 def _write_thumbnail(asset: Asset, scene_type: SceneType, path: Path) -> None:
     """A picture of the asset, by the project's own renderer."""
-    import torch
     from PIL import Image
 
-    from scene_envs.render.pictures import render
-    from scene_envs.render.stage import fit_camera, frame_scene_type
-    from scene_envs.scene import SceneBatch
+    from scene_envs.render.pictures import draw_picture
+    from scene_envs.render.raster import Pinhole
+    from scene_envs.render.stage import Stage, fit_camera, frame_scene_type
 
     points = np.asarray(visual_mesh(asset).vertices, dtype=np.float64)
     low, high = tuple(points.min(axis=0).tolist()), tuple(points.max(axis=0).tolist())
     alone = replace(scene_type, slots=1, welded=(), fixed=(), workspace=(low, high))
     position, target = fit_camera(points, frame_scene_type(alone).to_camera, 28.0, 1.0, 0.06)
     x, y = tuple(position.tolist()), tuple(target.tolist())
-    camera = Camera(x, y, (0.0, 0.0, 1.0), _THUMBNAIL, _THUMBNAIL, 28.0)
-    category = torch.tensor([[scene_type.assets.index(asset.name)]])
-    batch = SceneBatch.from_parts(torch.zeros(1, 1, 3), torch.eye(3)[None, None], category, alone)
+    camera = Pinhole.at(x, y, (0.0, 0.0, 1.0), 28.0, _THUMBNAIL, _THUMBNAIL)
+    stage = Stage((asset.name,), scene_type.asset_folders)
+    stage.place(np.zeros((1, 3)), np.eye(3)[None], np.zeros(1, dtype=np.int64))
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(render(batch, camera=camera)[0]).save(path)
+    Image.fromarray(draw_picture(stage, camera, alone, np.zeros(1, dtype=bool))).save(path)

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-import torch
 from gymnasium import logger
 from numpy.typing import NDArray
 
@@ -25,11 +24,13 @@ from scene_envs.render.stage import (
     soft_shadow,
     to_pinhole,
 )
-from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, SceneType
 
 if TYPE_CHECKING:
+    import torch
     from PIL import Image
+
+    from scene_envs.scene import SceneBatch
 
 
 Mode = Literal["rgb", "depth", "instance", "boxes", "category", "semantic", "normals"]
@@ -122,7 +123,7 @@ nothing is seen |
     >>> view["depth"][0, 1].round(3).tolist(), view["boxes"][0, 0].tolist()
     ([inf, 2.0, 2.0, 2.0, inf], [1, 0, 4, 3])
     """
-    views = list(observe_each(batch if len(batch) else SceneBatch.empty(batch.scene_type, 1), cameras, modes))
+    views = list(observe_each(batch if len(batch) else batch.empty(batch.scene_type, 1), cameras, modes))
     return [
         {mode: np.stack([view[index][mode] for view in views])[: len(batch)] for mode in modes}
         for index in range(len(views[0]))
@@ -171,7 +172,7 @@ def _as_mask(highlight: torch.Tensor | NDArray[np.bool_] | None, batch: SceneBat
     shape = tuple(batch.tensor.shape[:2])
     if highlight is None:
         return np.zeros(shape, dtype=bool)
-    mask = highlight.detach().cpu().numpy() if isinstance(highlight, torch.Tensor) else np.asarray(highlight)
+    mask = np.asarray(highlight.detach().cpu() if hasattr(highlight, "detach") else highlight)
     if mask.shape != shape:
         raise InvalidInputError(f"highlight marks objects of the batch, so its shape is {shape}; got {mask.shape}")
     return mask.astype(bool)
