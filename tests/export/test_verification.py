@@ -144,3 +144,8 @@ def test_sample_exports_only_what_all_judges_find_ready(tmp_path, monkeypatch, c
     assert json.loads((out / "verify.json").read_text())["ready_scenes"] == [True, False, True]
     assert not (out / "export" / "scene_000" / "scene.npz").exists()
     assert "2 of 3 scenes are ready for all judges; 1 dropped" in capsys.readouterr().out
+    monkeypatch.setattr(verification, "LIMITS", dict.fromkeys(verification.LIMITS, -1.0))  # nothing is within them
+    words[-1] = "export=worlds"
+    assert main(["sample", f"prior={prior}", *words, "verify=true", f"output={tmp_path / 'none'}"]) == 0
+    assert "export" not in json.loads((tmp_path / "none" / "metrics.json").read_text())
+    assert "0 of 3 scenes are ready for all judges; 3 dropped" in capsys.readouterr().out

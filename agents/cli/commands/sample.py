@@ -129,7 +129,8 @@ def run(settings: SampleConfig, run: Run) -> None:
         if formats is not None:
             if settings.verify:
                 batch = keep_verified(batch, formats, run, **keys)
-            metrics["export"] = export_scenes(batch, formats, run.directory / "export", pool, run, **keys)
+            if len(batch):
+                metrics["export"] = export_scenes(batch, formats, run.directory / "export", pool, run, **keys)
     run.write_metrics(metrics)
     run.say(f"written to {run.directory}")
 
