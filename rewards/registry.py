@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rewards.base import Reward, RewardContext, RewardOutput, facts_of
 from scene_envs.errors import InvalidInputError, RewardError
-from scene_envs.registry import PluginError, Registry, load_plugin, run_file
+from scene_envs.registry import ALLOWED, PluginError, Registry, load_plugin, run_file
 from scene_envs.scene import SceneBatch
 
 ENTRY_POINT_GROUP = "scene_envs.rewards"
@@ -27,7 +27,6 @@ Maker = TypeVar("Maker", bound=Callable[..., Any])
 
 _REWARDS: Registry[Callable[..., Any]] = Registry("reward", ENTRY_POINT_GROUP, read=lambda point: _of_plugin(point))
 _LOCAL = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)", re.DOTALL)
-_allowed: set[Path] = set()
 _allowed_targets: list[str] = ["rewards"]
 
 
@@ -110,12 +109,12 @@ def names_in(reward: Any) -> Iterator[str]:
 
 def allow_local_rewards(path: str | Path) -> None:
     """Let ``reward="PATH.py:NAME"`` run the file ``path``. Every other file is refused."""
-    _allowed.add(Path(path).expanduser().resolve())
+    ALLOWED.add(Path(path).expanduser().resolve())
 
 
 def allowed_files() -> list[Path]:
     """The files that may be run."""
-    return sorted(_allowed)
+    return sorted(ALLOWED)
 
 
 def load_local(reward: str) -> Callable[..., Any]:
@@ -125,7 +124,7 @@ def load_local(reward: str) -> Callable[..., Any]:
     match = _LOCAL.fullmatch(reward)
     assert match is not None
     path = Path(match["path"]).expanduser().resolve()
-    if path not in _allowed:
+    if path not in ALLOWED:
         raise InvalidInputError(
             f"reward {reward!r} would run the file {str(path)!r}, which was not allowed: give --allow-local on the "
             "command line, or call rewards.allow_local_rewards(path) in Python"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import difflib
 import math
+import operator
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any, get_args, get_type_hints
 
-_MAX_NUMBER = 1e30
+MAX_NUMBER = 1e30
 
 
 class SceneEnvsError(Exception):
@@ -72,7 +73,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
 
 def shown(value: Any) -> str:
     """A value in a message, of bounded length; Python refuses to write integers of thousands of digits."""
-    return "a very large number" if isinstance(value, int) and abs(value) > _MAX_NUMBER else repr(value)[:200]
+    return "a very large number" if isinstance(value, int) and abs(value) > MAX_NUMBER else repr(value)[:200]
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,10 @@ class Limit:
 
     def check(self, place: str, name: str, value: Any, optional: bool) -> None:
         """Raise unless it holds for the field ``name``, where null is a choice if it is ``optional``."""
-        with suppress(TypeError, OverflowError):  # no number, or one of thousands of digits
-            if (value is None and optional) or self.holds(value):
+        with suppress(TypeError, ValueError, OverflowError):  # no number, an array, or a number of thousands of digits
+            if (value is None and optional) or (not isinstance(value, bool) and self.holds(value)):
                 return
-        null = ", or null" if optional else ""
+        null = " and finite" * (isinstance(value, float) and value == math.inf) + ", or null" * optional
         raise InvalidInputError(f"{place}{name}={shown(value)} {self.rule}{null}")
 
 
@@ -114,8 +115,10 @@ def at_least(low: float) -> Limit:
 FINITE = Limit(math.isfinite, "must be a finite number")
 BELOW_ONE = Limit(lambda value: 0 <= value < 1, "must lie in [0, 1)")
 Positive = Annotated[float, Limit(lambda value: math.isfinite(value) and value > 0, "must be a positive number")]
-Count = Annotated[int, at_least(1)]
-Natural = Annotated[int, at_least(0)]
+Nonnegative = Annotated[float, Limit(lambda value: value >= 0, "must be at least 0")]  # infinity is no limit
+Unlimited = Annotated[float, Limit(lambda value: value > 0, "must be a positive number")]  # infinity is no limit
+Count = Annotated[int, Limit(lambda value: operator.index(value) >= 1, "must be at least 1")]
+Natural = Annotated[int, Limit(lambda value: operator.index(value) >= 0, "must be at least 0")]
 Seed = Annotated[int, Limit(lambda seed: 0 <= seed < 2**63, "must be from 0 to 2^63 - 1")]
 Share = Annotated[float, Limit(lambda value: 0 <= value <= 1, "is outside 0..1: it is a share")]
 
@@ -143,7 +146,13 @@ class Checked:
 @cache
 def _conditions(kind: type) -> list[tuple[str, Limit | OneOf, bool]]:
     """Name of the field, condition, and whether the field may be None."""
-    hints = get_type_hints(kind, include_extras=True)
+    try:
+        hints = get_type_hints(kind, include_extras=True)
+    except NameError as error:
+        raise InvalidInputError(
+            f"{kind.__qualname__}: the annotation of a field names {error.name!r}, which its module lacks when it runs;"
+            " import it outside `if TYPE_CHECKING:`"
+        ) from error
     parts = [(name, hint, part) for name, hint in hints.items() for part in (hint, *get_args(hint))]  # of a union, too
     return [
         (name, condition, type(None) in get_args(hint))

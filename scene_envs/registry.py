@@ -102,13 +102,18 @@ FILES = "SCENE_ENVS_FILES"
 processes that a command starts inherit it."""
 
 
+ALLOWED: set[Path] = set()
+"""Files of the user that may run without a question."""
+
+
 def run_file(path: Path) -> ModuleType:
     """The module of a Python file, which runs once per process; PluginError says why it cannot be run."""
+    path = path.expanduser().resolve()
     name = f"scene_envs_file_{hashlib.blake2b(str(path).encode(), digest_size=8).hexdigest()}"
     if name not in sys.modules:
         spec = spec_from_file_location(name, path)
-        assert spec is not None
-        assert spec.loader is not None
+        if spec is None or spec.loader is None:
+            raise PluginError(f"{str(path)!r} cannot be run: its name must end in .py")
         sys.modules[name] = module_from_spec(spec)
         try:
             spec.loader.exec_module(sys.modules[name])

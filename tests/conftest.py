@@ -53,7 +53,8 @@ def _coarse_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
     pictures = sys.modules.get("scene_envs.render.pictures")
     if pictures is None or request.path.parent.name == "render":
         return
-    draw, lamp = pictures.draw_picture, pictures.light_camera
+    stages = sys.modules["scene_envs.render.stage"]
+    draw, lamp = pictures.draw_picture, stages.light_camera
 
     def coarse(stage: Any, camera: Any, *scene: Any) -> Any:
         small = draw(stage, camera.resized(-(-camera.width // 4), -(-camera.height // 4)), *scene)
@@ -64,7 +65,7 @@ def _coarse_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
         return camera.resized(camera.width // 4, camera.height // 4)
 
     monkeypatch.setattr(pictures, "draw_picture", coarse)
-    monkeypatch.setattr(pictures, "light_camera", coarse_lamp)
+    monkeypatch.setattr(stages, "light_camera", coarse_lamp)
 
 
 @pytest.fixture(scope="session")

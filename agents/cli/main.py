@@ -44,7 +44,7 @@ from scene_envs.errors import (
     unknown_name,
 )
 from scene_envs.files import find_scenes
-from scene_envs.registry import FILES, PluginError, run_file
+from scene_envs.registry import ALLOWED, FILES, PluginError, run_file
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -77,7 +77,7 @@ _DATASETS = ("data", "heldout", "regularisation.scenes")
 _GRAMMAR = "grammar"
 _FROM_FILES = ("scene", "mask", "masks", "planner", "algorithm", "network")
 """Keys whose components a file may register; rewards (``reward``, ``objective``) load their files themselves."""
-_FILE = re.compile(r"(?P<path>[^\s,\[\]{}'\"]+\.py):(?P<name>[A-Za-z_]\w*)")
+_FILE = re.compile(r"(?P<path>[^\s,\[\]{}'\":][^,\[\]{}'\":]*\.py):(?P<name>[A-Za-z_]\w*)")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -213,11 +213,14 @@ def _without_file(word: str, allow_local: bool) -> str:
 
 
 def _ask_for_file(key: str, path: Path, allow_local: bool) -> None:
+    if path in ALLOWED:
+        return
     if not allow_local and sys.stdin is not None and sys.stdin.isatty():
         print(f"{key}= runs the file {path}. Run it? [y/N] ", end="", file=sys.stderr, flush=True)
         allow_local = sys.stdin.readline().strip().lower() in ("y", "yes")
     if not allow_local:
         raise InvalidInputError(f"{key}= would run the file {str(path)!r}; add --allow-local if you trust it")
+    ALLOWED.add(path)
 
 
 def _run(command: str, module: ModuleType, settings: Any, only_show: bool) -> None:
@@ -348,11 +351,10 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
         engine_name(physics)
     for key in ("reward", "objective"):
         if "/" in (text := str(getattr(settings, key, ""))) or ".py:" in text:
-            from rewards.registry import allow_local_rewards, allowed_files, local_files
+            from rewards.registry import local_files
 
-            for path in [path for path in local_files(getattr(settings, key)) if path not in allowed_files()]:
+            for path in local_files(getattr(settings, key)):
                 _ask_for_file(key, path, allow_local)
-                allow_local_rewards(path)
     if device not in ("auto", "cpu"):  # neither needs torch to be checked
         resolve_device(device)
 
@@ -360,6 +362,11 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
 def _check_name(kind: str, value: Any, known: Callable[[], Sequence[str]]) -> None:
     """Refuse a name that no component has."""
     name = value.get("name") if isinstance(value, dict) else value
+    if kind != "reward" and isinstance(name, str) and _FILE.fullmatch(name):
+        raise InvalidInputError(
+            f"{kind} {name!r}: in a file of keys, write the name alone, and list the Python file in the environment "
+            f"variable {FILES}"
+        )
     if isinstance(name, str) and name.isidentifier() and name not in (names := known()):
         raise unknown_name(kind, name, names)
 

@@ -57,6 +57,7 @@ _MAY_DIFFER = (
     "progress",
     "recipe",
     "reward_limits",
+    "formats",
 )
 """Keys that may change between a run and its repetition."""
 

@@ -15,7 +15,7 @@ from agents.configuration.composition import (
 )
 from agents.planning.gradient import GradientPlanner
 from agents.planning.ledger import PlannerSettings, list_planners, planner_settings
-from scene_envs.errors import Count, InvalidInputError, Natural, Positive
+from scene_envs.errors import Count, InvalidInputError, Natural, Unlimited
 
 
 @dataclass
@@ -24,7 +24,7 @@ class BudgetKeys:
 
     budget: int = 64
     max_nfe: int | None = None
-    max_seconds: Positive | None = None
+    max_seconds: Unlimited | None = None
     count: Count | None = None
     side_by_side: Count = 16
     baseline: bool = True

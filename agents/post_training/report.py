@@ -69,8 +69,7 @@ _LABELS = {
 }
 """Labels of the measured figures on the page."""
 _MEASURING = 2.0
-"""Seconds of measuring a scene for the report, physics included, over those of a training step for as many denoiser
-evaluations; an estimate for the time left."""
+"""Time to measure samples, over that to train on as many denoiser evaluations; an estimate for the time left."""
 
 
 def post_train_and_compare(

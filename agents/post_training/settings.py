@@ -24,7 +24,19 @@ from agents.configuration.composition import (
 )
 from agents.utils.loggers import LOGGERS
 from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance, check_guidance
-from scene_envs.errors import BELOW_ONE, Checked, Count, InvalidInputError, Limit, Natural, OneOf, Positive, at_least
+from scene_envs.errors import (
+    BELOW_ONE,
+    Checked,
+    Count,
+    InvalidInputError,
+    Limit,
+    Natural,
+    Nonnegative,
+    OneOf,
+    Positive,
+    Unlimited,
+    at_least,
+)
 from scene_envs.registry import Registry
 
 CREDITS = ("auto", "scene", "object")
@@ -121,7 +133,7 @@ class ForwardProcessSettings(AlgorithmSettings):
     credit: Annotated[str, OneOf(CREDITS)] = "auto"
     category_credit: Annotated[str, OneOf(CATEGORY_CREDITS)] = "auto"
     sampler_decay: Annotated[float, BELOW_ONE] = 0.9
-    advantage_clip: Positive = 2.0
+    advantage_clip: Unlimited = 2.0
     expectation_lr: Annotated[float, at_least(0)] = 3e-4
 
 
@@ -171,7 +183,7 @@ class GuidanceDistillationSettings(AlgorithmSettings):
     updates: Count = 4
     draws: Count = 2
     strength: Annotated[float, Limit(lambda value: 0 < value <= 1, "must lie in (0, 1]; 1 learns whole moves")] = 1.0
-    clip: Positive = 1.0
+    clip: Unlimited = 1.0
     sampler_decay: Annotated[float, BELOW_ONE] = 0.9
 
 
@@ -328,10 +340,10 @@ class GuardLimits(Checked):
         classifier: the same for the accuracy of a classifier that tells samples from real scenes.
     """
 
-    count: Annotated[float, at_least(0)] | None = None
-    stack: Annotated[float, at_least(0)] | None = None
-    category: Annotated[float, at_least(0)] | None = None
-    classifier: Annotated[float, at_least(0)] | None = None
+    count: Nonnegative | None = None
+    stack: Nonnegative | None = None
+    category: Nonnegative | None = None
+    classifier: Nonnegative | None = None
 
 
 @dataclass
@@ -352,7 +364,7 @@ class GuardSettings(Checked):
 
     every: Count = 5
     scenes: Count = 256
-    limit: Positive = 1.5
+    limit: Unlimited = 1.5
     action: Annotated[str, OneOf(("report", "stop", "rollback"))] = "report"
     samples: Natural = 128
     samples_every: Count = 20

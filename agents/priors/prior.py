@@ -31,6 +31,7 @@ from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
+from scene_envs.supports import welded_mask
 
 UNIONS = ("one_type", "any")
 """Assets that a scene of a union of scene types may hold: those of one of its types, or any."""
@@ -639,15 +640,9 @@ class ScenePrior(nn.Module, ABC):
             raise InvalidInputError(f"fill={fill}: give the most objects to add, at least 0, or None")
         open_slots = wide.is_empty if fill is None else wide.is_empty & (wide.is_empty.cumsum(dim=1) <= fill)
         return self.inpaint(
-            wide,
-            open_slots,
-            prompt=prompt,
-            guidance=guidance,
-            claim_guidance=claim_guidance,
-            physics_guidance=physics_guidance,
-            num_steps=num_steps,
-            seed=seed,
-        )
+            wide, open_slots, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance,
+            physics_guidance=physics_guidance, num_steps=num_steps, seed=seed,
+        )  # fmt: skip
 
     def rearrange(
         self, batch: SceneBatch, *, prompt: Prompt = None, guidance: float = 0.0,
@@ -660,15 +655,9 @@ class ScenePrior(nn.Module, ABC):
         free = batch.is_free
         mask = torch.stack([free, torch.zeros_like(free)], dim=-1)
         return self.inpaint(
-            batch,
-            mask,
-            prompt=prompt,
-            guidance=guidance,
-            claim_guidance=claim_guidance,
-            physics_guidance=physics_guidance,
-            num_steps=num_steps,
-            seed=seed,
-        )
+            batch, mask, prompt=prompt, guidance=guidance, claim_guidance=claim_guidance,
+            physics_guidance=physics_guidance, num_steps=num_steps, seed=seed,
+        )  # fmt: skip
 
     def closed_categories(self, batch: SceneBatch, mask: Tensor) -> Tensor:
         """(B, K) bool: categories that the slots under ``mask`` (B, N, 2) must not take.
@@ -677,8 +666,7 @@ class ScenePrior(nn.Module, ABC):
         masks furniture, so without this rule every further inpainting of empty slots would add furniture.
         """
         changed = mask[..., 1]
-        welded = torch.zeros(self.scene_type.num_assets + 1, dtype=torch.bool, device=changed.device)
-        welded[list(self.scene_type.welded_categories)] = True
+        welded = constant_on(welded_mask(self.scene_type), changed.device)
         furniture, changed = (x[:, len(self.scene_type.fixed) :] for x in (welded[batch.categories], changed))
         closed = (furniture & ~changed).any(dim=1) & ~(furniture & changed).any(dim=1)
         return closed[:, None] & welded

@@ -9,16 +9,17 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
-from scene_envs.errors import Checked, InvalidInputError, Limit, OneOf, Positive, shown
+from scene_envs.errors import MAX_NUMBER, Checked, InvalidInputError, Limit, OneOf, Positive, shown
 from scene_envs.scene_types import SceneType
 
 ACTION_MODES = ("next_sample", "noise")
 PROMPT_SOURCES = ("data", "grammar")
 """Values of ``prompt`` that select descriptions of scenes; any other text is a prompt itself."""
 
-_WHOLE = Limit(lambda number: type(number) is int and 1 <= number < 2**31, "must be a whole number of at least 1")
+_WHOLE = Limit(
+    lambda number: type(number) is int and 1 <= number < 2**31, "must be a whole number from 1 to 2,147,483,647"
+)
 _SLOTS = Limit(lambda number: type(number) is int and 1 <= number <= 10**5, "must be a whole number from 1 to 100,000")
-_MAX_NUMBER = 1e30
 MASKS = (
     "balanced", "blamed_or_empty", "culprits", "empty", "infeasible", "infeasible_or_empty", "off_prompt", "random",
 )  # fmt: skip
@@ -158,7 +159,7 @@ def _is_finite(number: Any) -> bool:
     if isinstance(number, bool) or not isinstance(number, int | float | np.integer | np.floating):
         return False
     size: Any = abs(number)
-    return bool(size <= _MAX_NUMBER)
+    return bool(size <= MAX_NUMBER)
 
 
 def takes(settings: type[Any]) -> Callable[[Init], Init]:

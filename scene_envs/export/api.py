@@ -74,9 +74,7 @@ def export(
         raise InvalidInputError(f"friction must be a finite number >= 0, got {friction}")
     names = resolve_formats(formats)
     writers = {name: _FORMATS[name].writer() for name in names}
-    settings = read_randomization(randomization)
-    if "color" in settings and (plain := {*names} - {"mjcf", "npz"}):
-        raise InvalidInputError(f"only mjcf carries randomized colours: leave out color, or {', '.join(sorted(plain))}")
+    settings = read_randomization(randomization, names)
     placed = [randomize(scene, settings) for scene in place(batch, friction)]
     root = Path(output)
     manifest = _claim(root, batch, friction, settings)
@@ -134,11 +132,12 @@ def _claim(root: Path, batch: SceneBatch, friction: float, randomization: Mappin
     path = root / MANIFEST
     if path.exists():
         found = read_manifest(path)
-        if any(found.get(key) != fresh.get(key) for key in (*list(fresh)[:4], "randomization")):
-            raise InvalidInputError(
-                f"{str(root)!r} holds an export of other scenes ({found['scenes']} of {found['scene_type']!r}); "
-                "choose another output, or remove that folder"
-            )
+        for key in ("scenes", "digest", "friction", "randomization"):
+            if (there := found.get(key)) != (given := fresh.get(key)):
+                which = f"these scenes with {key}={there}, not {given}" if key[0] in "fr" else "other scenes"
+                raise InvalidInputError(
+                    f"{str(root)!r} holds an export of {which}; choose another output, or remove that folder"
+                )
         return found
     taken = sorted(path.name for pattern in ("assets", "scene_[0-9]*", "worlds.*") for path in root.glob(pattern))
     if taken:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,14 @@ KEYS = ("mass", "friction", "color")
 """Factor of mass and inertia; coefficient of friction; factor of red, green and blue, cut to 0..1."""
 
 
-def read_randomization(source: str | os.PathLike[str] | Mapping[str, Any]) -> dict[str, Any]:
+def read_randomization(
+    source: str | os.PathLike[str] | Mapping[str, Any], formats: Iterable[str] = ()
+) -> dict[str, Any]:
     """Settings from a YAML file or a mapping: ``seed``, and for some of ``KEYS`` one distribution with its arguments;
     nothing for an empty source.
 
-    Raises InvalidInputError for a file that cannot be read, and for unknown keys and distributions.
+    Raises InvalidInputError for a file that cannot be read, for unknown keys and distributions, and for colours in one
+    of ``formats`` that carries none.
 
     >>> read_randomization({"mass": {"uniform": [0.8, 1.2]}})
     {'seed': 0, 'mass': {'uniform': [0.8, 1.2]}}
@@ -34,14 +38,19 @@ def read_randomization(source: str | os.PathLike[str] | Mapping[str, Any]) -> di
         if not source:
             return {}
         found = source if isinstance(source, Mapping) else yaml.safe_load(Path(source).read_text(encoding="utf-8"))
-        settings = {"seed": 0, **found}
+        settings: dict[str, Any] = json.loads(json.dumps({"seed": 0, **found}))  # as a manifest holds them
+        np.random.default_rng(settings["seed"])
         for key in settings.keys() - {"seed"}:
-            _draw(settings, KEYS[KEYS.index(key)], 1, [])
-    except (OSError, ValueError, TypeError, AttributeError, yaml.YAMLError) as error:
+            if key not in KEYS:
+                raise ValueError(f"unknown key {key!r}")
+            _draw(settings, key, 1, [])
+    except (OSError, ValueError, TypeError, AttributeError, OverflowError, yaml.YAMLError) as error:
         raise InvalidInputError(
             f"randomization={str(source)[:200]!r}: {' '.join(str(error).split())}; write seed: 0 and some of "
             f"{', '.join(KEYS)} as mass: {{uniform: [0.8, 1.2]}}, with one of {', '.join(DISTRIBUTIONS)}"
         ) from error
+    if "color" in settings and (plain := {*formats} - {"mjcf", "npz"}):
+        raise InvalidInputError(f"only mjcf carries randomized colours: leave out color, or {', '.join(sorted(plain))}")
     return settings
 
 
@@ -69,4 +78,6 @@ def _draw(settings: Mapping[str, Any], key: str, count: int, numbers: list[int])
     """(count, 3) draws; each key has its own stream."""
     ((name, values),) = settings[key].items()
     rng = np.random.default_rng([settings["seed"], KEYS.index(key), *numbers])
-    return getattr(rng, DISTRIBUTIONS[DISTRIBUTIONS.index(name)])(*values, size=(count, 3))
+    if name not in DISTRIBUTIONS:
+        raise ValueError(f"{key}: unknown distribution {name!r}")
+    return getattr(rng, name)(*values, size=(count, 3))

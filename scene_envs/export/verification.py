@@ -52,7 +52,8 @@ class Verification:
     @property
     def ready(self) -> tuple[bool, ...]:
         """For each scene, whether all judges find it ready."""
-        return tuple(not any(found.faults for found in self.findings if found.scene == name) for name in self.scenes)
+        faulty = {found.scene for found in self.findings if found.faults}
+        return tuple(name not in faulty for name in self.scenes)
 
     def __str__(self) -> str:
         titles = ("overlap, mm", "0.1 s: mm", "mrad", "2 s: mm", "seconds")
@@ -85,16 +86,16 @@ def verify(path: str | os.PathLike[str]) -> Verification:
     versions: dict[str, str] = {}
     missing: dict[str, str] = {}
     for judge, (file, module, package, judged) in JUDGES.items():
-        places = [(root / scene / file, root / f"{scene}{Path(file).suffix}") for scene in scenes]
-        paths = [path for two in places for path in two if path.is_file()]
+        paths = [root / file.format(scene) for scene in scenes]
         if find_spec(module) is None:
             missing[judge] = f"not installed: pip install {package}"
-        elif len(paths) < len(scenes):
-            missing[judge] = f"no {file} in the export"
+        elif not all(path.is_file() for path in paths):
+            missing[judge] = f"no {file.format(scenes[0] if scenes else 'scene').rpartition('/')[2]} in the export"
         elif file == _POSES and (manifest["friction"] != FRICTION or manifest.get("randomization")):
             missing[judge] = "has other friction or masses than the files"
         else:
-            versions[judge] = importlib.metadata.version(package.strip('"').partition("[")[0])
+            found = importlib.metadata.distributions(name=package.strip('"').partition("[")[0])
+            versions[judge] = next((one.version for one in found), "unknown")  # as of Drake from apt
             findings += [_find(scene, judge, judged, path) for scene, path in zip(scenes, paths, strict=True)]
     if not findings:
         raise InvalidInputError(f"{str(root)!r} has no scene, or no file that can be judged here: {missing}")
@@ -239,15 +240,15 @@ def _drake(path: Path) -> Objects:
     return _objects(list(bodies), pairs, after)
 
 
-_POSES, _NEWTON = "scene.npz", '"newton[sim,importers]"'
+_POSES, _NEWTON = "{}/scene.npz", '"newton[sim,importers]"'
 JUDGES: dict[str, tuple[str, str, str, Callable[[Path], Objects]]] = {
     "bullet engine": (_POSES, "pybullet", "pybullet", partial(_engine, "bullet")),
     "mujoco engine": (_POSES, "mujoco", "mujoco", partial(_engine, "mujoco")),
-    "MuJoCo, MJCF": ("scene.xml", "mujoco", "mujoco", _mujoco),
-    "Newton, MJCF": ("scene.xml", "newton", _NEWTON, _newton),
-    "Newton, USD": ("scene.usda", "newton", _NEWTON, _newton),
-    "PyBullet, URDF": ("objects.json", "pybullet", "pybullet", _pybullet),
-    "Drake, directives": ("scene.dmd.yaml", "pydrake", "drake", _drake),
-    "Drake, SDF": ("world.sdf", "pydrake", "drake", _drake),
+    "MuJoCo, MJCF": ("{}/scene.xml", "mujoco", "mujoco", _mujoco),
+    "Newton, MJCF": ("{}/scene.xml", "newton", _NEWTON, _newton),
+    "Newton, USD": ("{}.usda", "newton", _NEWTON, _newton),
+    "PyBullet, URDF": ("{}/objects.json", "pybullet", "pybullet", _pybullet),
+    "Drake, directives": ("{}/scene.dmd.yaml", "pydrake", "drake", _drake),
+    "Drake, SDF": ("{}/world.sdf", "pydrake", "drake", _drake),
 }
-"""Of each judge: the file of a scene that it reads, the module and the package that it needs, and its function."""
+"""Of each judge: the file that it reads, ``{}`` for the scene's name, module and package that it needs, function."""

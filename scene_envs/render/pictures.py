@@ -18,7 +18,6 @@ from scene_envs.render.stage import (
     contact_shade,
     frame_scene_type,
     get_stage,
-    light_camera,
     picture_camera,
     scene_type_of_one,
     soft_shadow,
@@ -205,7 +204,7 @@ def draw_picture(stage: Stage, camera: Pinhole, scene_type: SceneType, marked: N
 
     height, width = camera.height, camera.width
     framing = frame_scene_type(scene_type)
-    frame, light = stage.look(camera.resized(2 * width, 2 * height)), stage.look(light_camera(scene_type))
+    frame, light = stage.look(camera.resized(2 * width, 2 * height)), stage.lamp(scene_type)
     # Size (m) of a pixel of the lamp's image
     texel = float(np.linalg.norm(light.camera.pose[:3, 3] - framing.center) / light.camera.fx)
     normals = stage.normals(camera)

@@ -58,6 +58,7 @@ class Stage:
         Poses are translations (N, 3) m and rotations (N, 3, 3). Slots whose category (N,) is outside the library are
         empty.
         """
+        self._lamps: dict[SceneType, Frame] = {}
         # In an order that does not depend on slots, which decides between surfaces at the same place
         order = np.lexsort((*translations.T, categories))
         slots = [slot for slot in order.tolist() if 0 <= categories[slot] < len(self._library)]
@@ -73,6 +74,12 @@ class Stage:
         self._slots, self._starts = slots, starts[:-1]
         # (F,): the slot of each triangle
         self.slot_of = np.repeat(np.array(slots, dtype=np.int64), [len(model.faces) for model in models])
+
+    def lamp(self, scene_type: SceneType) -> Frame:
+        """What the lamp of the type's pictures sees of the placed objects; the same for all cameras."""
+        if scene_type not in self._lamps:
+            self._lamps[scene_type] = self.look(light_camera(scene_type))
+        return self._lamps[scene_type]
 
     def look(self, camera: Pinhole) -> Frame:
         """What ``camera`` sees of the placed objects."""
@@ -356,6 +363,8 @@ def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
 def to_pinhole(camera: Camera | Pinhole, width: int | None = None, height: int | None = None) -> Pinhole:
     """The pinhole camera of any camera, with images of another size where one is given."""
     width, height = camera.width if width is None else width, camera.height if height is None else height
+    if width < 1 or height < 1:
+        raise InvalidInputError(f"width={width}, height={height}: an image has at least one pixel each way")
     if isinstance(camera, Pinhole):
         return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
     return Pinhole.at(camera.position, camera.target, camera.up, camera.fov_y, width, height)

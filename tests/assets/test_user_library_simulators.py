@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from scene_envs import SceneBatch
 from scene_envs.assets import Asset, import_report, load_library
@@ -298,3 +299,24 @@ def test_points_that_place_prototypes_are_refused(tmp_path: Path) -> None:
     pytest.importorskip("pxr")
     with pytest.raises(InvalidInputError, match="point instancer"):
         listed(tmp_path, "it.usda", usd('def PointInstancer "many" {}'))
+
+
+def test_a_folder_leaves_out_what_an_mjcf_includes(tmp_path: Path) -> None:
+    (tmp_path / "assets").mkdir()
+    (tmp_path / "parts").mkdir()
+    trimesh.creation.box((0.2, 0.1, 0.05)).export(tmp_path / "assets" / "b.stl")
+    body = "<body><freejoint/><geom type='mesh' mesh='b'/></body>"
+    head = "<compiler assetdir='assets'/><include file='parts/inc.xml'/>"
+    (tmp_path / "cup.xml").write_text(f"<mujoco>{head}<worldbody>{body}</worldbody></mujoco>")
+    (tmp_path / "parts" / "inc.xml").write_text("<mujoco><asset><mesh file='b.stl'/></asset></mujoco>")
+    (asset,) = load_library(tmp_path)
+    assert asset.name == "cup"
+    assert asset.mass == pytest.approx(1000 * 0.2 * 0.1 * 0.05)
+
+
+def test_a_face_beyond_the_vertices_is_named(tmp_path: Path) -> None:
+    corners = "".join(f"v {x} {y} 0\n" for x in (0, 1) for y in (0, 1))
+    with pytest.raises(CorruptFileError, match="a face refers to vertex -4 of 4"):
+        listed(tmp_path, "it.obj", f"{corners}f -9 -3 -2 -1\n")
+    with pytest.raises(CorruptFileError, match="a face refers to vertex 7 of 4"):
+        listed(tmp_path, "it.obj", f"{corners}f 1 2 7 3\n")

@@ -421,7 +421,9 @@ REWARD_FILE = "def few(batch):\n    return -batch.counts.float()\n"
 @pytest.fixture
 def reward_files(tmp_path, monkeypatch):
     """Two files of rewards; what is allowed in a test is forgotten after it."""
-    monkeypatch.setattr(local_files, "_allowed", set())
+    allowed: set[Path] = set()
+    for module in (local_files, MAIN):
+        monkeypatch.setattr(module, "ALLOWED", allowed)
     monkeypatch.setattr(MAIN, "_run", lambda *_: 0)  # what is tested comes before the work
     for name in ("one.py", "two.py"):
         (tmp_path / name).write_text(REWARD_FILE)
@@ -449,8 +451,18 @@ def test_the_file_of_a_reward_runs_after_a_flag_or_a_yes(reward_files, monkeypat
     assert main(["sample", word]) == 0
     assert local_files.allowed_files() == [reward_files / "one.py"]
     assert main(["sample", word]) == 0  # asked once in a process
-    local_files._allowed.clear()
+    local_files.ALLOWED.clear()
     assert main(["sample", word, "--allow-local"]) == 0
+
+
+def test_a_file_is_asked_about_once(reward_files, monkeypatch, capsys):
+    file = reward_files / "one.py"
+    answered(monkeypatch, "y")
+    monkeypatch.setenv("SCENE_ENVS_FILES", "")
+    assert main(["search", f"masks=[{file}:few, {file}:few]", f"objective={file}:few"]) == 2  # it registers no mask
+    said = capsys.readouterr().err
+    assert said.count("Run it?") == 1
+    assert "unknown mask 'few'" in said
 
 
 def test_a_yes_to_one_file_is_no_yes_to_another(reward_files, monkeypatch, capsys):
@@ -502,6 +514,12 @@ def test_masks_planners_and_scene_types_come_from_files(
     assert yaml.safe_load(capsys.readouterr().out)["scene"] == "pantry_of_file"
     assert main(["search", f"mask={file}:lower", "--allow-local"]) == 2
     assert "unknown mask 'lower'" in capsys.readouterr().err
+    spaced = tmp_path / "my files" / "mine.py"
+    assert main(["search", f"mask={spaced}:lower", "--allow-local"]) == 2
+    assert f"there is no file {str(spaced)!r}" in capsys.readouterr().err
+    (tmp_path / "keys.yaml").write_text(f"mask: {file}:upper_of_file\n")
+    assert main(["search", "--config", str(tmp_path / "keys.yaml")]) == 2
+    assert "list the Python file in the environment variable SCENE_ENVS_FILES" in capsys.readouterr().err
     assert main(["search", f"mask={tmp_path}/other.py:lower", "--allow-local"]) == 2
     assert "there is no file" in capsys.readouterr().err
     code = (

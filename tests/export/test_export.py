@@ -222,7 +222,7 @@ def test_other_scenes_are_not_overwritten(tmp_path):
     other = other.with_poses(other.translations + 0.01, other.rotations)
     with pytest.raises(InvalidInputError, match="export of other scenes"):
         export(other, tmp_path / "one", "npz")
-    with pytest.raises(InvalidInputError, match="export of other scenes"):
+    with pytest.raises(InvalidInputError, match=r"export of these scenes with friction=0.6, not 0.9"):
         export(laid_scene(), tmp_path / "one", "npz", friction=0.9)
     (tmp_path / "two" / "assets").mkdir(parents=True)
     with pytest.raises(InvalidInputError, match="already holds 'assets'"):

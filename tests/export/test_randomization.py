@@ -137,7 +137,7 @@ def test_without_distributions_nothing_changes(tmp_path):
     found = content(tmp_path / "fixed")
     assert found.pop("scene_000/randomization.json")
     assert {**found, "export.json": b""} == {**content(tmp_path / "plain"), "export.json": b""}
-    with pytest.raises(InvalidInputError, match="export of other scenes"):
+    with pytest.raises(InvalidInputError, match="export of these scenes with randomization=None, not"):
         export(laid_scene(), tmp_path / "plain", formats, randomization=SETTINGS)
 
 
@@ -185,3 +185,39 @@ def test_worlds_hold_what_the_json_says(tmp_path):
         if name in assets():
             assert found["world/body_mass"][0, body] == pytest.approx(drawn[name]["mass"])
     assert {row["friction"] for row in drawn.values()} == set(found["world/geom_friction"][0, :, 0].tolist())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"weight": {"uniform": [1, 2]}}, "unknown key 'weight'"),
+        ({"mass": {"gauss": [1, 2]}}, "mass: unknown distribution 'gauss'"),
+        ({"mass": {"uniform": [0, float("inf")]}}, "range exceeds valid bounds"),
+        ({"mass": {"uniform": np.array([1.0, 2.0])}}, "not JSON serializable"),
+        ({"seed": -1}, "non-negative"),
+    ],
+)
+def test_what_cannot_be_drawn_is_named(settings, message):
+    with pytest.raises(InvalidInputError, match=message):
+        read_randomization(settings)
+
+
+def test_formats_join_a_randomized_export_and_other_values_are_named(tmp_path):
+    batch = laid_scene()
+    export(batch, tmp_path, "mjcf", randomization={"mass": {"uniform": (0.7, 1.4)}})
+    assert export(batch, tmp_path, "sdf", randomization={"mass": {"uniform": [0.7, 1.4]}}).formats == ("sdf",)
+    with pytest.raises(InvalidInputError, match="of these scenes with randomization="):
+        export(batch, tmp_path, "sdf")
+    with pytest.raises(InvalidInputError, match=r"of these scenes with friction=0.6, not 0.5"):
+        export(batch, tmp_path, "sdf", friction=0.5, randomization={"mass": {"uniform": [0.7, 1.4]}})
+
+
+def test_the_commands_refuse_colours_and_lost_settings_before_they_work(tmp_path, capsys):
+    file = tmp_path / "colour.yaml"
+    file.write_text("color: {uniform: [0.5, 1]}")
+    assert main(["export", "scenes=none", "formats=drake", f"randomization={file}"]) == 2
+    assert "only mjcf carries randomized colours" in capsys.readouterr().err
+    assert main(["sample", "export=[mjcf, sdf]", f"randomization={file}"]) == 2
+    assert "leave out color, or sdf" in capsys.readouterr().err
+    assert main(["sample", f"randomization={file}"]) == 2
+    assert "randomization= changes exported scenes; add export=" in capsys.readouterr().err

@@ -149,3 +149,23 @@ def test_sample_exports_only_what_all_judges_find_ready(tmp_path, monkeypatch, c
     assert main(["sample", f"prior={prior}", *words, "verify=true", f"output={tmp_path / 'none'}"]) == 0
     assert "export" not in json.loads((tmp_path / "none" / "metrics.json").read_text())
     assert "0 of 3 scenes are ready for all judges; 3 dropped" in capsys.readouterr().out
+
+
+def test_a_former_file_of_a_scene_and_a_lost_version_end_no_verdict(tmp_path, monkeypatch):
+    export(plate(), tmp_path, ["npz", "mjcf"])
+    file, module, _, judged = verification.JUDGES["MuJoCo, MJCF"]
+    monkeypatch.setitem(verification.JUDGES, "MuJoCo, MJCF", (file, module, "no-such-package", judged))
+    (tmp_path / "scene_000.xml").write_text("an export of before")
+    report = verify(tmp_path)
+    assert report.versions["MuJoCo, MJCF"] == "unknown"
+    assert report.ready == (True,)
+
+
+def test_sample_has_a_judge_for_each_format(tmp_path, capsys):
+    (tmp_path / "mass.yaml").write_text("mass: {uniform: [0.9, 1.1]}")
+    prior = tiny_prior(slots=4).save(tmp_path / "prior")
+    words = ["count=1", "num_steps=2", "reward=null", "pictures=0", "workers=0", "project=true", "export=worlds"]
+    words += ["verify=true", f"randomization={tmp_path / 'mass.yaml'}", f"output={tmp_path / 'out'}"]
+    for _ in range(2):  # the same command again writes the same
+        assert main(["sample", f"prior={prior}", *words]) == 0
+    assert "MuJoCo, MJCF" in capsys.readouterr().out

@@ -35,8 +35,11 @@ COMMANDS = {
 _TOGETHER = {
     "complete": "inpaint",
     "rearrange": "inpaint",
+    "project": "export",
     "verify": "export",
-    "doctor": "post_train",
+    "pretrain": "training",
+    "post-train": "training",
+    "doctor": "training",
     "check-reward": "rewards",
     "package-prior": "priors",
 }

@@ -1,4 +1,4 @@
-"""``scene-envs export`` and ``verify``."""
+"""``scene-envs project``, ``export`` and ``verify``."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any
 
-from agents.cli.commands.scenes import draw, load_prior, make_ready
+from agents.cli.commands.scenes import draw, draw_scenes, load_prior, make_ready
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
-from scene_envs.errors import Count, InvalidInputError, Natural, PhysicsError, at_least
+from scene_envs.errors import Checked, Count, InvalidInputError, Natural, PhysicsError, at_least
 
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
@@ -21,6 +21,27 @@ if TYPE_CHECKING:
 
 _OVERLAP = 1e-3
 """Overlap (m) above which a simulator visibly pushes objects apart."""
+
+
+@dataclass
+class ProjectConfig(Checked):
+    """Scenes made simulation-ready.
+
+    Attributes:
+        scenes: a scene file, a folder of scene files, the folder of a sample or search run, or a dataset.
+        count: number of scenes, from the first; null for all.
+        pictures: number of scenes in the galleries; 0 draws none.
+        workers: physics worker processes; 0 computes physics in this process.
+        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
+        output: folder for ready.safetensors, before.png and ready.png.
+    """
+
+    scenes: str = ""
+    count: Count | None = None
+    pictures: Natural = 12
+    workers: Natural = 2
+    physics: str = "auto"
+    output: str = ""
 
 
 @dataclass
@@ -75,8 +96,7 @@ def check(settings: ExportConfig) -> None:
             "export: name either a scene file, run or dataset, as in scenes=runs/mine, or a prior, as in "
             "prior=dimsum_table"
         )
-    check_formats(settings.formats)
-    read_randomization(settings.randomization)
+    read_randomization(settings.randomization, check_formats(settings.formats))
 
 
 def run(settings: ExportConfig, run: Run) -> None:
@@ -130,7 +150,7 @@ def keep_verified(batch: SceneBatch, formats: Sequence[str], run: Run, **keys: A
     from scene_envs.export import export, verify
 
     with tempfile.TemporaryDirectory(dir=run.directory) as folder:
-        export(batch, folder, [*formats, "npz"], **keys)
+        export(batch, folder, [*formats, "mjcf", "npz"], **keys)  # each scene has a judge, whatever is installed
         report = verify(folder)
         for name in ("verify.json", "verify.txt"):
             Path(folder, name).replace(run.directory / name)
@@ -159,4 +179,23 @@ def run_verify(settings: VerifyConfig) -> None:
         raise PhysicsError(f"{report.ready.count(False)} of {len(report.scenes)} scenes are not ready for all judges")
 
 
+def check_project(settings: ProjectConfig) -> None:
+    """Refuse settings that name no scenes."""
+    if not settings.scenes:
+        raise InvalidInputError("project: name a scene file, run or dataset, as in scenes=runs/mine")
+
+
+def run_project(settings: ProjectConfig, run: Run) -> None:
+    """Project and settle the scenes, and count the ready objects."""
+    from scene_envs.datasets import load_scenes
+    from scene_envs.physics import make_pool
+
+    batch = load_scenes(Path(settings.scenes), settings.count)
+    with make_pool(settings.workers, physics=settings.physics) as pool:
+        draw_scenes(batch, settings.pictures, run, "before.png")
+        run.write_metrics({"scenes": len(batch), "ready": make_ready(batch, settings.pictures, pool, run)})
+    run.say(f"written to {run.directory}")
+
+
+project = SimpleNamespace(run=run_project, check=check_project)
 verify = SimpleNamespace(run=run_verify, WRITES=False, POSITIONAL=("path",))

@@ -81,15 +81,16 @@ def load_prior_and_scenes(command: str, settings: InpaintingConfig) -> tuple[Sce
 
 def save_scenes(before: SceneBatch, after: SceneBatch, pictures: int, run: Run, figures: dict[str, float]) -> None:
     """Write the scenes, both galleries and the metrics, with the shares of free objects that are feasible."""
-    from agents.evaluation.physics_figures import leaving_out
+    from agents.evaluation.physics_figures import leaving_out, per_scene_and_fraction
     from scene_envs.physics import feasibility
 
     after.save(run.directory / "scenes.safetensors")
     with leaving_out("feasible", {}):
         for name, batch in (("feasible_before", before), ("feasible", after)) if before.scene_type.has_geometry else ():
-            verdict, free = feasibility(batch), batch.is_free
-            figures[name] = float(verdict.feasible.sum() / free[verdict.valid].sum().clamp(min=1))
-            run.say(f"{name.replace('_', ' ')}: {figures[name]:.0%} of the free objects")
+            verdict = feasibility(batch)
+            figures |= per_scene_and_fraction(name, batch, verdict.counts, verdict.valid)
+            if (share := figures.get(f"{name}_fraction")) is not None:
+                run.say(f"{name.replace('_', ' ')}: {share:.0%} of the free objects")
     draw_scenes(before, pictures, run, "before.png")
     draw_scenes(after, pictures, run, "gallery.png")
     run.write_metrics({"scenes": len(after), **figures})

@@ -97,6 +97,8 @@ def _cameras(path: str) -> list[Any]:
 
     try:
         entries = json.loads(Path(path).read_text()) if path else []
+        if path and not (isinstance(entries, list) and entries):
+            raise ValueError("it is no list of at least one camera")
         return [Pinhole(**entry) if "pose" in entry else Camera(**entry) for entry in entries]
     except (OSError, ValueError, TypeError) as error:
         raise InvalidInputError(f"cameras={path}: no JSON list of cameras could be read there: {error}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +16,9 @@ from scene_envs.errors import Count, InvalidInputError, OneOf, at_least
 if TYPE_CHECKING:
     from scene_envs.scene import SceneBatch
     from scene_envs.scene_types import SceneType
+
+
+_SAMPLED = ("prompt", "guidance", "claim_guidance", "eta", "slots", "batch_size")
 
 
 @dataclass
@@ -52,9 +56,9 @@ def check(settings: SampleConfig) -> None:
     from scene_envs.export.formats import check_formats
     from scene_envs.export.randomization import read_randomization
 
-    if settings.export is not None:
-        check_formats(settings.export)
-    read_randomization(settings.randomization)
+    formats = () if settings.export is None else check_formats(settings.export)
+    if read_randomization(settings.randomization, formats) and not formats:
+        raise InvalidInputError("randomization= changes exported scenes; add export=, as export=mjcf")
     if settings.verify and not (settings.project and settings.export is not None):
         raise InvalidInputError("verify=true judges exported scenes; add project=true and export=, as export=mjcf")
 
@@ -63,9 +67,8 @@ def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.evaluation.physics_figures import leaving_out
     from agents.priors.guidance import physics_strength
-    from rewards import needs_prompts, reward_name
     from rewards.process import close_reward, run_reward
-    from scene_envs.envs.scoring import no_prompts
+    from scene_envs.envs.scoring import RewardScorer
     from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import make_pool
     from scene_envs.scene import SceneBatch
@@ -80,8 +83,7 @@ def run(settings: SampleConfig, run: Run) -> None:
             workers=settings.workers,
             physics=settings.physics,
         )
-        if needs_prompts(reward) and settings.prompt is None:
-            raise InvalidInputError(no_prompts(reward_name(reward)))
+        RewardScorer(reward, prompted=settings.prompt is not None)  # refuses one that needs prompts
     prior = load_prior(settings).with_union(settings.union)
     if not prior.scene_type.has_geometry:
         settings = _without_geometry(settings, prior.scene_type, run)
@@ -92,13 +94,8 @@ def run(settings: SampleConfig, run: Run) -> None:
         prior,
         settings,
         settings.count,
-        prompt=settings.prompt,
-        guidance=settings.guidance,
-        claim_guidance=settings.claim_guidance,
         physics_guidance=strength,
-        eta=settings.eta,
-        slots=settings.slots,
-        batch_size=settings.batch_size,
+        **{key: getattr(settings, key) for key in _SAMPLED},
     )
     seconds = time.perf_counter() - started
     guided = f", with physics_guidance={strength:g}" if strength else ""
@@ -129,6 +126,7 @@ def run(settings: SampleConfig, run: Run) -> None:
         if formats is not None:
             if settings.verify:
                 batch = keep_verified(batch, formats, run, **keys)
+                shutil.rmtree(run.directory / "export", ignore_errors=True)  # of this run, perhaps with other judges
             if len(batch):
                 metrics["export"] = export_scenes(batch, formats, run.directory / "export", pool, run, **keys)
     run.write_metrics(metrics)
@@ -136,10 +134,7 @@ def run(settings: SampleConfig, run: Run) -> None:
 
 
 def _claims_followed(batch: SceneBatch, settings: SampleConfig, run: Run) -> dict[str, Any]:
-    """Shares of the claims of the prompt that hold, and of the scenes in which all do; says them, and what raises them.
-
-    A prompt that cannot be read as claims is said, and has no figures.
-    """
+    """Shares of the claims of the prompt that hold, and of scenes in which all do; says them, or why there are none."""
     from rewards import PromptMatch, RewardContext
 
     try:

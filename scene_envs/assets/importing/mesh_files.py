@@ -306,8 +306,8 @@ def _cut_faces(lines: list[str], path: Path) -> str:
                 faces[number][at] = "/".join(place)
     words = [corner for corners in faces.values() for corner in corners]
     index = np.array([int(word.partition("/")[0]) - 1 for word in words], dtype=np.int64)
-    if index.min() < 0 or index.max() >= len(points):
-        raise CorruptFileError(f"{path}: a face refers to vertex {index.max() + 1} of {len(points)}")
+    if len(wrong := index[(index < 0) | (index >= len(points))]):
+        raise CorruptFileError(f"{path}: a face refers to vertex {wrong[0] + 1} of {len(points)}")
     counts = np.array([len(corners) for corners in faces.values()], dtype=np.int64)
     numbers, found = list(faces), cut_polygons(np.array(points), index, counts)
     for row, polygon in zip(found[0].tolist(), found[1].tolist(), strict=True):
@@ -404,8 +404,8 @@ def _check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
     if not np.isfinite(vertices).all():
         row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
         raise CorruptFileError(f"{path}: vertex {row} is {vertices[row].tolist()}; coordinates must be finite")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise CorruptFileError(f"{path}: a triangle refers to vertex {int(faces.max())} of {len(vertices)}")
+    if len(wrong := faces[(faces < 0) | (faces >= len(vertices))]):
+        raise CorruptFileError(f"{path}: a triangle refers to vertex {int(wrong[0])} of {len(vertices)}")
 
 
 def _check_texture(mesh: Any, path: Path) -> None:

@@ -157,8 +157,14 @@ def _named_files(path: Path) -> set[Path]:
         root = read_xml(path)
     except SceneEnvsError:
         return set()
-    places = [compiler.get("meshdir", "") for compiler in root.iter("compiler")] or [""]
-    found = {(path.parent / place / mesh.get("file", "")).resolve() for mesh in root.iter("mesh") for place in places}
+    found = {(path.parent / part.get("file", "")).resolve() for part in root.iter("include") if part.get("file")}
+    roots = [root]
+    for part in found:
+        with contextlib.suppress(SceneEnvsError, OSError):
+            roots.append(read_xml(part))
+    places = [item.get("meshdir", item.get("assetdir", "")) for one in roots for item in one.iter("compiler")] or [""]
+    meshes = [mesh.get("file", "") for one in roots for mesh in one.iter("mesh")]
+    found |= {(path.parent / place / mesh).resolve() for mesh in meshes for place in places}
     for uri in [mesh.get("filename") or mesh.findtext("uri") or "" for mesh in root.iter("mesh")]:
         with contextlib.suppress(SceneEnvsError, OSError):
             found.add(find_mesh(uri, path, "a mesh"))

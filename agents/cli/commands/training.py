@@ -1,4 +1,4 @@
-"""``scene-envs post-train`` and ``doctor``."""
+"""``scene-envs pretrain``, ``post-train`` and ``doctor``."""
 
 from __future__ import annotations
 
@@ -8,9 +8,20 @@ from typing import Any
 
 from agents.cli.run_folder import Run
 from agents.post_training.settings import PostTrainConfig
+from agents.pretraining.settings import PretrainConfig
 
 
-def run(settings: PostTrainConfig, run: Run) -> None:
+def run_pretrain(settings: PretrainConfig, run: Run) -> None:
+    """Train the prior; the trainer writes its own metrics."""
+    from agents.pretraining.trainer import pretrain
+
+    metrics = pretrain(settings)
+    loss = "" if metrics["heldout_loss"] is None else f"held-out loss {metrics['heldout_loss']:.4g} after "
+    run.say(f"{loss}{metrics['trained_steps']} steps")
+    run.say(f"sample it: scene-envs sample prior={run.directory}")
+
+
+def run_post_train(settings: PostTrainConfig, run: Run) -> None:
     """Post-train and report; the trainer and the report write the metrics."""
     from agents.post_training import post_train, post_train_and_compare
     from agents.utils.process_group import is_first_process
@@ -63,4 +74,4 @@ def run_doctor(settings: PostTrainConfig, run: Run) -> None:
         run.log(line)
 
 
-doctor = SimpleNamespace(run=run_doctor)
+pretrain, post_train, doctor = (SimpleNamespace(run=run) for run in (run_pretrain, run_post_train, run_doctor))
