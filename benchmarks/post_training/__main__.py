@@ -20,13 +20,13 @@ class PostTrainingTables:
     """A table of post-training: its runs, their samples and those of the base priors.
 
     Attributes:
-        table: stability, placement, equal_scenes, counts, prompts, realism or frontier.
+        table: stability, placement, equal_scenes, counts, prompts, realism, frontier or losses.
         rows: patterns of the names of rows to run and show, such as [dimsum_table-nft-*]; empty for all.
         iterations: iterations of every run; null takes the number of the table.
         count: number of measured samples of each prior.
         keys: further keys of post-train for every run, such as ["batch_size=8"].
         train: train missing rows; false only tabulates the results in the folder.
-        output: folder of the runs, the figures and table.md; a second call resumes there.
+        output: folder of the runs, the figures, table.md and table.csv; a second call resumes there.
     """
 
     table: str = "stability"
@@ -42,7 +42,7 @@ def run(settings: PostTrainingTables, run: Run) -> None:
     """Train and measure what is missing, and write the table after every row."""
     from benchmarks.post_training.rows import TABLES, Row
     from benchmarks.post_training.runs import guard_figures, kept_loss, measure, train, training_figures
-    from benchmarks.post_training.tables import markdown
+    from benchmarks.post_training.tables import comma_separated, markdown
     from scene_envs.files import write_text
 
     if settings.table not in TABLES:
@@ -67,9 +67,8 @@ def run(settings: PostTrainingTables, run: Run) -> None:
         figures["seconds_per_iteration"] = figures["seconds"] / figures["iterations"]
         if table.measures and (folder / "metrics.json").exists():
             prior = str(folder)
-            figures |= measure(
-                prior, run.directory / f"{row.name}-figures", table.measures, settings.count, row.guidance
-            )
+            measured_at = run.directory / f"{row.name}-figures"
+            figures |= measure(prior, measured_at, table.measures, settings.count, row.guidance, table.evaluate)
             figures |= kept_loss(folder)
         return figures
 
@@ -78,10 +77,13 @@ def run(settings: PostTrainingTables, run: Run) -> None:
         if table.measures and row.prior not in measured:
             measured.add(row.prior)
             base = run.directory / f"{row.prior}-figures"
-            lines.append((row.prior, measure(row.prior, base, table.measures, settings.count, row.guidance)))
+            figures = measure(row.prior, base, table.measures, settings.count, row.guidance, table.evaluate)
+            lines.append((row.prior, figures))
         lines.append((row.name, figures_of(row)))
-        text = markdown(table.title, ("iterations", *table.columns, "seconds"), lines)
+        columns = ("iterations", *table.columns, "seconds")
+        text = markdown(table.title, columns, lines)
         write_text(run.directory / "table.md", text)
+        write_text(run.directory / "table.csv", comma_separated(columns, lines))
     run.say(text)
 
 

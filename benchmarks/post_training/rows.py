@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 SCENES = 48
 """Scenes of an iteration, the default of ``post-train``."""
@@ -13,6 +14,8 @@ TYPES = (
 )  # fmt: skip
 FORWARD, CHAIN = "nft", "ddpo_sf"
 DISTILLATION = "guidance_distillation"
+PLUG_INS = ("udm_grpo", "crd", "gardo")
+"""Algorithms of files in ``examples/``."""
 LENGTH = 300
 """Iterations of a row."""
 
@@ -47,12 +50,14 @@ class Table:
         rows: one for each run.
         measures: groups of ``evaluate`` that the samples get; empty for tables of the training alone.
         columns: figures shown, by the names of ``COLUMNS``.
+        evaluate: further keys of ``evaluate``.
     """
 
     title: str
     rows: tuple[Row, ...]
     measures: tuple[str, ...]
     columns: tuple[str, ...]
+    evaluate: tuple[str, ...] = ()
 
 
 def _stability() -> tuple[Row, ...]:
@@ -79,14 +84,29 @@ def _placement() -> tuple[Row, ...]:
     )
 
 
+_960_SCENES = ("batch_size=24", "guard.scenes=128", "guard.samples=128", "guard.every=20", "guard.samples_every=20")
+"""Keys of 40 iterations with 960 sampled scenes."""
+_LAST = ("batch_size=24", "guard.scenes=128", "guard.samples=0", "guard.every=40", "regularisation.bank_size=1152")
+"""The same without samples of the guard, which checks the last prior only and so keeps it."""
+
+
 def _equal_scenes() -> tuple[Row, ...]:
     """960 sampled scenes for each algorithm and scene type; the guard samples the base prior and the trained one."""
-    guard = ("guard.scenes=128", "guard.samples=128", "guard.every=20", "guard.samples_every=20")
     return tuple(
-        Row(f"{prior}-{name}-{seed}", prior, (*_keys(name, "feasible_share", seed), "batch_size=24", *guard), 40)
+        Row(f"{prior}-{name}-{seed}", prior, (*_keys(name, "feasible_share", seed), *_960_SCENES), 40)
         for prior in TYPES
         for name in (FORWARD, CHAIN, DISTILLATION)
         for seed in range(3 if prior == "dimsum_table" else 1)
+    )
+
+
+def _losses() -> tuple[Row, ...]:
+    """Every loss after 960 sampled scenes of Dimsum, the losses of ``examples/`` too: two rewards, three seeds."""
+    return tuple(
+        Row(f"dimsum_table-{name}-{reward}-{seed}", "dimsum_table", (*_keys(name, reward, seed), *_LAST), 40)
+        for seed in range(3)
+        for reward in ("feasible_share", "object_count")
+        for name in (FORWARD, "awm", CHAIN, "ddpo_is", DISTILLATION, *PLUG_INS)
     )
 
 
@@ -140,6 +160,8 @@ def _frontier() -> tuple[Row, ...]:
 
 
 def _keys(algorithm: str, reward: str, seed: int) -> tuple[str, ...]:
+    if algorithm in PLUG_INS:
+        algorithm = f"{Path(__file__).parents[2] / 'examples' / algorithm}.py:{algorithm}"
     return f"algorithm={algorithm}", f"reward={reward}", f"seed={seed}"
 
 
@@ -154,6 +176,10 @@ TABLES: dict[str, Table] = {
     "equal_scenes": Table("Feasible share after 960 scenes", _equal_scenes(), (),
                           ("base_reward", "guard_reward", "kept", "loss", "guard_counts", "base_classifier",
                            "guard_classifier")),
+    "losses": Table("Losses after 960 scenes", _losses(), ("layout", "physics"),
+                    ("share", "free", "collision", "loss", "count_wasserstein", "category_kl", "spacing",
+                     "training_seconds"),
+                    ("num_steps=25", "pictures=0")),
     "counts": Table("Object counts past the data", _counts(), ("layout", "physics"),
                     ("free", "feasible", "share", "loss", "count_wasserstein", "category_kl")),
     "prompts": Table("Following prompts", _prompts(), _WITH_PROMPTS,

@@ -33,14 +33,14 @@ def train(row: Row, directory: Path, iterations: int, extra: Sequence[str]) -> P
     folder = directory / row.name
     if not (folder / "metrics.json").exists():
         _call(
-            "post-train", f"prior={row.prior}", *row.keys, f"iterations={iterations}", f"output={folder}",
-            "progress=none", "logger.report_scenes=0", *extra,
+            "post-train", "--allow-local", f"prior={row.prior}", *row.keys, f"iterations={iterations}",
+            f"output={folder}", "progress=none", "logger.report_scenes=0", *extra,
         )  # fmt: skip
     return folder
 
 
 def measure(
-    prior: str, directory: Path, measures: Sequence[str], count: int, guidance: float = 0.0
+    prior: str, directory: Path, measures: Sequence[str], count: int, guidance: float = 0.0, extra: Sequence[str] = ()
 ) -> dict[str, float]:
     """Figures of ``evaluate`` for a prior, computed once for each folder; an interrupted evaluation goes on.
 
@@ -50,12 +50,13 @@ def measure(
         measures: groups of figures.
         count: samples.
         guidance: weight of guidance of the samples with prompts.
+        extra: further keys of ``evaluate``.
     """
     if not _measured(directory / "metrics.json", measures):
         names = ",".join(measures)
         _call(
             "evaluate", f"prior={prior}", f"measures=[{names}]", f"count={count}", f"guidance={guidance}",
-            "physics_guidance=0", "workers=0", f"output={directory}",
+            "physics_guidance=0", "workers=0", f"output={directory}", *extra,
         )  # fmt: skip
     return _numbers(json.loads((directory / "metrics.json").read_text(encoding="utf-8")))
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable, Mapping, Sequence
+from io import StringIO
 
 Figures = Mapping[str, float]
 
@@ -24,6 +26,7 @@ COLUMNS: dict[str, tuple[str, str, Callable[[float], str]]] = {
     "loss": ("held-out loss", "loss", _plain(3)),
     "count_wasserstein": ("W₁ of counts", "count_wasserstein", _plain(2)),
     "category_kl": ("category KL × 10⁴", "category_kl_e4", _plain(1)),
+    "spacing": ("W₁ of spacing, mm", "spacing_wasserstein_mm", _plain(1)),
     "classifier": ("classifier", "classifier_accuracy", _percent),
     "prompt_counts": ("counts followed", "prompt_counts", _percent),
     "prompt_names": ("names", "prompt_names", _percent),
@@ -38,6 +41,7 @@ COLUMNS: dict[str, tuple[str, str, Callable[[float], str]]] = {
     "best": ("best 20", "best", _percent),
     "last": ("last 20", "last", _percent),
     "fall": ("largest fall", "fall", _percent),
+    "training_seconds": ("seconds", "seconds", _plain(0)),
     "seconds": ("seconds per iteration", "seconds_per_iteration", _plain(1)),
 }
 """Heading, figure and format of each column."""
@@ -62,3 +66,19 @@ def markdown(title: str, columns: Sequence[str], lines: Sequence[tuple[str, Figu
         cells = [write(figures[name]) if name in figures else "" for _, name, write in shown]
         body.append("|".join(["", f" {label} ", *(f" {cell} " if cell else " " for cell in cells), ""]))
     return "\n".join([f"## {title}", "", *head, *body, ""])
+
+
+def comma_separated(columns: Sequence[str], lines: Sequence[tuple[str, Figures]]) -> str:
+    """The figures of a table as CSV, not rounded; a figure that a line lacks is left empty.
+
+    >>> print(comma_separated(["free"], [("base", {"free_objects_mean": 17.125}), ("not run", {})]).strip())
+    run,free_objects_mean
+    base,17.125
+    not run,
+    """
+    names = [COLUMNS[name][1] for name in columns]
+    file = StringIO()
+    writer = csv.DictWriter(file, ["run", *names], extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({"run": label, **figures} for label, figures in lines)
+    return file.getvalue()

@@ -22,7 +22,7 @@ from agents.post_training.algorithms.base import (
 )
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import finished_scenes
-from agents.post_training.settings import AWMSettings, NFTSettings
+from agents.post_training.settings import ForwardProcessSettings, NFTSettings
 from agents.priors.prior import NoisedScenes, ScenePrior
 from agents.utils.process_group import ProcessGroup, gather_rows
 from scene_envs.errors import InvalidInputError
@@ -296,14 +296,18 @@ class ForwardProcess(AveragedSampler):
 
     loss: ForwardProcessLoss
 
-    def __init__(self, settings: NFTSettings | AWMSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
+    def __init__(self, settings: ForwardProcessSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         super().__init__(policy, sampler_decay=settings.sampler_decay)
         self.settings = settings
         self.advantage = ForwardAdvantage(credit=settings.credit, category_credit=settings.category_credit)
         rate = settings.expectation_lr
         self.expectation = Expectation(self.sampler, rate) if rate else None
+        self.loss = self.make_loss(settings)
+
+    def make_loss(self, settings: Any) -> ForwardProcessLoss:
+        """The loss of these settings; an algorithm with another loss overrides this method."""
         kind = NFTLoss if isinstance(settings, NFTSettings) else AWMLoss
-        self.loss = kind(
+        return kind(
             self.prior, self.sampler, beta=settings.beta, clip=settings.advantage_clip, expectation=self.expectation
         )
 
