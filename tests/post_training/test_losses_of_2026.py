@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torch import Generator, Tensor
 from torch.distributions import Categorical, Normal
 
-from agents.post_training import DenoisingPolicy, ForwardProcessLoss, PostTrainConfig, PostTrainer, post_train
+from agents.post_training import DenoisingPolicy, PostTrainConfig, post_train
 from agents.post_training.algorithms.forward_process import AWMLoss, NFTLoss
 from agents.post_training.settings import make_algorithm
 from agents.priors.prior import ScenePrior
@@ -82,7 +82,9 @@ class TestUDMGRPO:
         assert ours.norm() > 0
         torch.testing.assert_close(ours, 0.5 * awm, rtol=1e-4, atol=1e-7)
 
-    @pytest.mark.parametrize(("advantage", "moved", "pushes"), [(1.0, 0.5, False), (1.0, -0.5, True), (-1.0, 0.5, True)])
+    @pytest.mark.parametrize(
+        ("advantage", "moved", "pushes"), [(1.0, 0.5, False), (1.0, -0.5, True), (-1.0, 0.5, True)]
+    )
     def test_beyond_the_clip_only_a_step_back_has_a_gradient(
         self, udm_grpo: ModuleType, advantage: float, moved: float, pushes: bool
     ) -> None:
@@ -122,7 +124,8 @@ class TestCRD:
             objective(output).backward()
             found = found - 0.02 * output.grad
         assert float(found) == pytest.approx(0.2 / (2 * beta), abs=1e-6)
-        assert float(found) == pytest.approx(math.tanh(0.2 / (2 * beta)), abs=0.01)  # the exact tilted mean, tau = 2 beta
+        exact = math.tanh(0.2 / (2 * beta))  # the mean of the tilted policy with tau = 2 beta
+        assert float(found) == pytest.approx(exact, abs=0.01)
 
     def test_a_constant_of_the_reward_of_a_group_changes_nothing(self, crd: ModuleType) -> None:
         """This is the normaliser: it depends on the prompt alone."""
@@ -186,7 +189,8 @@ class TestGARDO:
 
     def test_the_penalty_is_that_of_uncertain_scenes_alone(self, gardo: ModuleType, prior: ScenePrior) -> None:
         """Its gradient at no advantage is that of the squared distance, and of the KL divergence, of these scenes."""
-        scenes = own_scenes(prior, advantage=torch.zeros(4, 1), uncertain=torch.tensor([[True], [False], [False], [True]]))
+        uncertain = torch.tensor([[True], [False], [False], [True]])
+        scenes = own_scenes(prior, advantage=torch.zeros(4, 1), uncertain=uncertain)
         loss = gardo.GARDOLoss(prior, deepcopy(prior))
         loss.reference, loss.penalty = tiny_prior("dimsum_table", seed=1, process=prior.process_name), 0.5
         noised = prior.noised(scenes["scene"], Generator().manual_seed(3))
