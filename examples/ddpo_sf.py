@@ -122,7 +122,7 @@ def main(args: Args) -> None:
     policy = DenoisingPolicy(prior, args.num_steps)
     weights = gradient_weights(policy.stds(env.core.slots), min_std=args.min_std)
     advantage = Advantage(credit="scene", clip=args.advantage_clip)
-    loss = DDPOSFLoss(policy, step_weights=weights, reduction="mean")
+    loss = DDPOSFLoss(policy, step_weights=weights)
     optimizer = torch.optim.AdamW(prior.parameters(), lr=args.learning_rate, weight_decay=0.0)
     grammar = get_grammar(prior.scene_type.name)
     real = prior.encode(grammar.sample(np.random.default_rng(args.seed), args.real_scenes))

@@ -121,7 +121,7 @@ def test_the_loss_starts_as_the_policy_gradient_and_holds_the_policy_back() -> N
     rollout = collect(DenoisingTorchRLEnv(3, prior=prior, reward="object_count", num_steps=4, slots=6), policy, seed=0)
     advantage = compute_advantages(torch.tensor([1.0, 2.0, 4.0]), torch.ones(3, dtype=torch.bool))
     ours = make_algorithm(algorithm_settings("proximal")(min_std=1e-3), policy, policy.stds(6)).loss
-    plain = DDPOSFLoss(policy, step_weights=ours.step_weights, reduction="mean")
+    plain = DDPOSFLoss(policy, step_weights=ours.step_weights)
     parameters = list(prior.denoiser.network.parameters())
     transitions = rollout[:, 1].set("advantage", advantage)
     found, expected = (

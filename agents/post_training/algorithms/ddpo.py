@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from agents.post_training.algorithms.base import (
@@ -21,8 +21,6 @@ from agents.post_training.settings import DDPOISSettings, DDPOSFSettings
 from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
 
-REDUCTIONS = ("sum", "mean")
-
 
 class DDPOSFLoss(PlainLoss):
     """Denoising diffusion policy optimisation (Black et al. 2024), Eq. 3 (score function) or Eq. 4 (clipped).
@@ -35,12 +33,11 @@ class DDPOSFLoss(PlainLoss):
     freed before the next is built, so memory does not grow with the length of the chain. Known entries, the
     deterministic last step and steps of weight 0 do not enter the loss.
 
+    log p is a mean over the random entries of a scene, as in the published code. This decides the scale of the
+    gradient, and so the meaning of the coefficient of any other loss. Over rows the loss is a mean, never over steps.
+
     With ``clip_epsilon``, ``min(ratio * A, clip(ratio, 1 ± epsilon) * A)`` replaces A * log p. The ratio is that of the
     *reduced* probabilities to those stored at sampling; before the first update it is exactly 1.
-
-    The reduction of log p over the entries of a scene is ``"sum"`` (the log-probability itself) or ``"mean"`` (divided
-    by the number of random entries, as in the published code). It decides the scale of the gradient, and so the
-    meaning of the coefficient of any other loss. Over rows the loss is always a mean, never over steps.
 
     Accepted keys (``set_keys`` renames them):
         scene: (B, N, D) float, x_t.
@@ -49,17 +46,14 @@ class DDPOSFLoss(PlainLoss):
         advantage: (B,) or (B, 1) float, or (B, N) for credit per slot.
         sample_log_prob: (B, N) float, log-probability per slot at sampling, by default under ``"slot_log_prob"``; read
             when clipping, and optional without.
-        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean. If ``("next", valid)`` is present, as
-            in the output of a collector, the whole episode of a scene that the reward could not score is left out. Rows
-            must then be transitions in order along the last dimension, and ``("next", "done")`` marks where an episode
-            ends.
+        valid: (B,) or (B, 1) bool, optional; False rows are left out of the mean.
+            :class:`~agents.post_training.Advantage` writes it for all steps of a scene that the reward could not score.
         text, text_mask: (B, L, W) tokens and (B, L) their mask, optional, as the policy saw them.
         prompt: (B, L) int64 token indices, optional, read where ``text`` is missing.
 
     Args:
         policy: policy that is optimised.
         step_weights: (S,) weight of every step; None means 1 wherever the step is random.
-        reduction: ``"sum"`` or ``"mean"`` of log p over the random entries of a scene.
         clip_epsilon: half-width of the ratio's clip, or None for the plain score function.
 
     Returns (``forward``): ``loss_objective`` (), and detached ``log_ratio`` (), the largest |log ratio|, and
@@ -90,21 +84,16 @@ class DDPOSFLoss(PlainLoss):
         policy: DenoisingPolicy,
         *,
         step_weights: Tensor | None = None,
-        reduction: str = "sum",
         clip_epsilon: float | None = None,
     ) -> None:
         super().__init__()
-        if reduction not in REDUCTIONS:
-            raise InvalidInputError(f"reduction={reduction!r} is not known; use 'sum' or 'mean'")
         if clip_epsilon is not None and not 0 < clip_epsilon < 1:
             raise InvalidInputError(f"clip_epsilon={clip_epsilon} must lie between 0 and 1, or be None")
         if step_weights is not None and step_weights.shape != (len(policy),):
             raise InvalidInputError(
                 f"step_weights has shape {tuple(step_weights.shape)}, the chain {len(policy)} steps"
             )
-        self.policy = policy
-        self.reduction = reduction
-        self.clip_epsilon = clip_epsilon
+        self.policy, self.clip_epsilon = policy, clip_epsilon
         weights = torch.ones(len(policy)) if step_weights is None else step_weights.float()
         self.register_buffer("step_weights", weights)
         self._entries: dict[int, int] = {}
@@ -123,7 +112,8 @@ class DDPOSFLoss(PlainLoss):
         old = flat.get(keys.sample_log_prob, None)
         if old is None and self.clip_epsilon is not None:
             raise InvalidInputError(f"clipping needs the log-probabilities at sampling under {keys.sample_log_prob!r}")
-        kept = self._kept(tensordict)
+        valid = flat.get(keys.valid, None)
+        kept = torch.ones_like(timestep, dtype=torch.bool) if valid is None else valid.reshape(-1)
         text, prompt = self._text(flat), flat.get(keys.prompt, None)
         if text is None and prompt is not None:
             text = self.policy.read(prompt)
@@ -147,7 +137,10 @@ class DDPOSFLoss(PlainLoss):
 
     def _objective(self, log_prob: Tensor, advantage: Tensor, old: Tensor | None) -> tuple[Tensor, Tensor]:
         """(b,) objective and (b,) share of clipped terms, from (b, N) log-probabilities and advantages."""
-        entries = self._count_entries(log_prob.shape[1])
+        slots = log_prob.shape[1]
+        if slots not in self._entries:
+            self._entries[slots] = self.policy.random_entries(slots)
+        entries = self._entries[slots]
         if advantage.shape[1] == 1:  # credit per scene
             log_prob = log_prob.sum(dim=1, keepdim=True)
             old = None if old is None else old.sum(dim=1, keepdim=True)
@@ -158,31 +151,6 @@ class DDPOSFLoss(PlainLoss):
         bounded = ratio.clamp(1 - self.clip_epsilon, 1 + self.clip_epsilon)
         surrogate = torch.minimum(ratio * advantage, bounded * advantage)
         return surrogate.sum(dim=1), (ratio != bounded).float().mean(dim=1).detach()
-
-    def _kept(self, tensordict: TensorDictBase) -> Tensor:
-        """(rows,) bool: transitions of scenes that the reward could score."""
-        shape, key = tensordict.batch_size, self.tensor_keys.valid
-        here, after = tensordict.get(key, None), tensordict.get(unravel_key(("next", key)), None)
-        kept = torch.ones(shape, dtype=torch.bool, device=tensordict.get(self.tensor_keys.scene).device)
-        if here is not None:
-            kept = kept & here.reshape(shape)
-        if after is None:
-            return kept.reshape(-1)
-        episode = after.reshape(shape).clone()
-        done = tensordict.get(("next", "done"), None)
-        if done is not None and len(shape) > 1:
-            ends = done.reshape(shape)
-            for step in reversed(range(shape[-1] - 1)):
-                episode[..., step] &= ends[..., step] | episode[..., step + 1]
-        return (kept & episode).reshape(-1)
-
-    def _count_entries(self, slots: int) -> int:
-        """Divisor of log-probabilities."""
-        if self.reduction != "mean":
-            return 1
-        if slots not in self._entries:
-            self._entries[slots] = self.policy.random_entries(slots)
-        return self._entries[slots]
 
 
 class DDPO(Algorithm):
@@ -198,7 +166,7 @@ class DDPO(Algorithm):
         self.advantage = Advantage(credit=settings.credit)
         weights = gradient_weights(stds, min_std=settings.min_std)
         clip = settings.clip_epsilon if isinstance(settings, DDPOISSettings) else None
-        self.loss = DDPOSFLoss(policy, step_weights=weights, reduction="mean", clip_epsilon=clip).to(
+        self.loss = DDPOSFLoss(policy, step_weights=weights, clip_epsilon=clip).to(
             next(policy.parameters()).device
         )
 
