@@ -190,7 +190,6 @@ class SampleCheck:
     slots: int | None = None  # per sample
     prompts: Sequence[str] | None = None  # one per sample
     guidance: float = 0.0  # weight of classifier-free guidance
-    claim_guidance: float = 0.0  # strength
 
     @torch.no_grad()
     def sample(self, prior: ScenePrior) -> SceneBatch:
@@ -210,7 +209,6 @@ class SampleCheck:
             count,
             prompt=prompts,
             guidance=self.guidance if guided else 0.0,
-            claim_guidance=self.claim_guidance if guided else 0.0,
             physics_guidance=0.0,
             num_steps=self.num_steps,
             slots=self.slots,

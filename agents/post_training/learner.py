@@ -154,7 +154,6 @@ class Learner:
                 FIRST_SAMPLES,
                 prompt=prompts,
                 guidance=self.policy.guidance if prompts else 0.0,
-                claim_guidance=self.policy.claim_guidance if prompts else 0.0,
                 physics_guidance=0.0,
                 num_steps=len(self.policy),
                 slots=self.slots,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
@@ -13,8 +12,6 @@ from torch import Generator, Tensor
 from agents.diffusion import ReverseStep
 from agents.diffusion.reverse_steps import MixedStep, concatenate_steps
 from agents.networks.text import Text
-from agents.priors.guidance import Hook
-from agents.priors.prior import ScenePrior
 from scene_envs.errors import InvalidInputError
 from scene_envs.protocols import PriorLike, PromptedPriorLike, StepTableLike
 
@@ -31,7 +28,6 @@ class DenoisingPolicy(TensorDictModuleBase):
         num_steps: number of steps of the chain, as in the environment.
         chunk: number of scenes denoised at once, for sampling and for log-probabilities; None takes all.
         guidance: weight w of classifier-free guidance; if it is not 0, the guided chain is the policy.
-        claim_guidance: strength of :meth:`claim_hook`.
         independent: whether slots draw their categories independently, so that log-probabilities are exact; False draws
             as ``prior.sample`` does.
 
@@ -53,7 +49,6 @@ class DenoisingPolicy(TensorDictModuleBase):
         *,
         chunk: int | None = None,
         guidance: float = 0.0,
-        claim_guidance: float = 0.0,
         independent: bool = True,
     ) -> None:
         super().__init__()
@@ -62,7 +57,6 @@ class DenoisingPolicy(TensorDictModuleBase):
         self.prior = prior
         self.chunk = chunk
         self.guidance = guidance
-        self.claim_guidance = claim_guidance
         self.independent = independent
         if prior.conditional:
             self.in_keys = [*self.in_keys, "prompt"]
@@ -91,14 +85,6 @@ class DenoisingPolicy(TensorDictModuleBase):
         parts = [reader.encode_tokens(part) for part in prompt.split(size)]
         return torch.cat([tokens for tokens, _ in parts]), torch.cat([mask for _, mask in parts])
 
-    def claim_hook(self, prompts: Sequence[str] | None, slots: int) -> Hook | None:
-        """Hook of :meth:`draw` that guides scenes to the claims of their ``prompts``; None without guidance."""
-        if prompts is None or not self.claim_guidance:
-            return None
-        return cast(ScenePrior, self.prior).sampling_hook(
-            len(prompts), slots, len(self), prompts=prompts, claim_guidance=self.claim_guidance
-        )
-
     def distribution(self, x_t: Tensor, step: int, text: Text | None = None) -> ReverseStep:
         """p(x_{t-1} | x_t) of ``x_t`` (B, N, D) given ``text``; differentiable in the prior's parameters."""
         size = self.chunk or x_t.shape[0]
@@ -119,16 +105,12 @@ class DenoisingPolicy(TensorDictModuleBase):
         generator: Generator | None = None,
         text: Text | None = None,
         noise: Tensor | None = None,
-        hook: Hook | None = None,
     ) -> tuple[Tensor, Tensor]:
         """An action (B, N, D) and its log-probability per slot (B, N), without gradients.
 
         The action is made from standard normal ``noise`` (B, N, D). If ``noise`` is None, ``generator`` draws it.
-        ``hook`` may change the distribution; :meth:`log_prob` does not know of such changes.
         """
         reverse = self.distribution(x_t, step, text)
-        if hook is not None:
-            reverse = hook(step, x_t, reverse)
         if noise is None:
             noise = torch.randn(x_t.shape, generator=generator, device=x_t.device)
         action = reverse.from_noise(noise)

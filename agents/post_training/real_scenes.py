@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -107,16 +107,24 @@ def kept_scenes(
     """The real scenes of a run, kept in its folder with the prompts of a dataset; the first process draws them.
     ``reuse`` loads those that are already in the folder, as a resumed run does.
     """
-    path, texts, processes = directory / SCENES_NAME, directory / PROMPTS_NAME, ProcessGroup.current()
-    if processes.is_first and not (reuse and path.exists()):
-        count = settings.bank_size
+
+    def draw() -> SceneBatch:
+        texts, count = directory / PROMPTS_NAME, settings.bank_size
         batch, found = real_scenes(prior, settings.scenes, count, seed=seed, slots=slots, progress=progress)
-        writing(f"the real scenes {str(path)!r}", lambda: batch.save(path))
         texts.unlink(missing_ok=True)  # prompts of other scenes, left by a run without a checkpoint
         if found is not None and prior.conditional:
             write_text(texts, json.dumps([list(prompts) for prompts in found]) + "\n")
-        processes.wait()
         return batch
+
+    return _kept(directory / SCENES_NAME, reuse, draw)
+
+
+def _kept(path: Path, reuse: bool, draw: Callable[[], SceneBatch]) -> SceneBatch:
+    """The scenes in ``path``, which the first process draws and writes, unless ``reuse`` finds them there."""
+    processes = ProcessGroup.current()
+    if processes.is_first and not (reuse and path.exists()):
+        batch = draw()
+        writing(f"the scenes {str(path)!r}", lambda: batch.save(path))
     processes.wait()
     return SceneBatch.load(path)
 
@@ -194,20 +202,15 @@ def kept_base_samples(
     """The base prior's samples of a run, kept in its folder; the first process draws them, or ``reuse`` loads them.
     They have the prompts of real scenes, so that prompts do not distinguish samples from real scenes.
     """
-    path, processes = directory / BASE_SAMPLES_NAME, ProcessGroup.current()
     prompts = bank.batch(count, Generator().manual_seed(stream_seed(seed, "base_prompts"))).prompts
-    if processes.is_first and not (reuse and path.exists()):
+
+    def draw() -> SceneBatch:
         with Progress("base samples", count, style=progress, always=(0,)) as shown:
             shown.update(0, "", f"drawing {count} samples of the base prior")
-            batch = base.sample(
-                count,
-                prompt=prompts,
-                physics_guidance=0.0,
-                num_steps=num_steps,
-                slots=bank.train.shape[1],
-                seed=stream_seed(seed, "base_samples"),
-                batch_size=batch_size,
-            )
-        writing(f"the base prior's samples {str(path)!r}", lambda: batch.save(path))
-    processes.wait()
-    return PromptedScenes(base.encode(SceneBatch.load(path).to(base.device)), prompts)
+            return base.sample(
+                count, prompt=prompts, physics_guidance=0.0, num_steps=num_steps, slots=bank.train.shape[1],
+                seed=stream_seed(seed, "base_samples"), batch_size=batch_size,
+            )  # fmt: skip
+
+    samples = _kept(directory / BASE_SAMPLES_NAME, reuse, draw)
+    return PromptedScenes(base.encode(samples.to(base.device)), prompts)

@@ -50,7 +50,6 @@ class Regularisation:
 
     def __init__(self, settings: RegularisationSettings, prior: ScenePrior) -> None:
         self.settings = settings
-        self.target = settings.target
         self.state = HoldState()
         compares = settings.objective == "discriminative"
         self.base = deepcopy(prior).eval().requires_grad_(False) if compares else None
@@ -83,16 +82,16 @@ class Regularisation:
                 prior, scenes.scenes, self.weight, generator.set_state(begun), loss=of, chunk=chunk,
                 prompts=scenes.prompts,
             )  # fmt: skip
-        if self.target is not None:
+        if self.settings.hold is not None:
             row |= {"regularisation_weight": self.weight, "hold_factor": self.state.factor}
         return row
 
     def observe(self, ratio: float, iteration: int) -> None:
         """Adjust the weight after a check of the guard, whose held-out loss is ``ratio`` times the base prior's."""
-        if self.target is None:
+        if self.settings.hold is None:
             return
         held = self.state.lost_at is None
-        self.state = adjust(self.state, self.target, ratio, iteration)
+        self.state = adjust(self.state, self.settings.hold, ratio, iteration)
         if held and self.state.lost_at is not None:
             logger.warning("%s", self.verdict())
 
@@ -100,30 +99,30 @@ class Regularisation:
         """Keep the weight, and forget how the held-out loss changed before a return to a checkpoint, whose held-out
         loss is ``ratio`` times the base prior's.
         """
-        self.state = self.state.returned(ratio)
+        self.state = replace(self.state, measured=ratio, slope=0.0)
 
     def verdict(self) -> str:
         """One sentence that says whether the target was held; empty without a target."""
         state, settings = self.state, self.settings
-        if self.target is None or state.measured is None:
+        if self.settings.hold is None or state.measured is None:
             return ""
-        if state.lost_at is None and relative_error(self.target, state.measured) > MAX_FINAL_ERROR:
+        if state.lost_at is None and relative_error(self.settings.hold, state.measured) > MAX_FINAL_ERROR:
             return (
-                f"hold={settings.hold} was not held at the end: guard {state.measured:.4g} at the last measurement, "
+                f"hold={settings.hold:g} was not held at the end: guard {state.measured:.4g} at the last measurement, "
                 f"when the weight of the regularisation was {state.factor:.3g} times the first one and still rising; "
                 "measure more often (guard.every), raise the weight, or lower optimizer.lr"
             )
         if state.lost_at is None:
-            return f"hold={settings.hold} was held: guard {state.measured:.4g} at the last measurement."
+            return f"hold={settings.hold:g} was held: guard {state.measured:.4g} at the last measurement."
         return (
-            f"hold={settings.hold} could not be held: at iteration {state.lost_at} the weight of the regularisation "
+            f"hold={settings.hold:g} could not be held: at iteration {state.lost_at} the weight of the regularisation "
             f"was at its bound, {MAX_FACTOR:g} times the first one, and the held-out loss was still above the target "
             f"({state.measured:.4g} at the last measurement); lower optimizer.lr, raise the weight, or allow more"
         )
 
     def summary(self) -> dict[str, Any] | None:
         """Values for the metrics; None without a target."""
-        if self.target is None:
+        if self.settings.hold is None:
             return None
         return {
             "target": self.settings.hold,
@@ -238,10 +237,6 @@ class HoldState:
     def factor(self) -> float:
         """Factor on the weight."""
         return math.exp(self.log_factor)
-
-    def returned(self, measured: float) -> HoldState:
-        """The state after a return to an earlier checkpoint of ratio ``measured``, which is no change by training."""
-        return replace(self, measured=measured, slope=0.0)
 
 
 def adjust(state: HoldState, target: float, measured: float, iteration: int) -> HoldState:

@@ -122,7 +122,7 @@ def post_train_and_compare(
         def measure(prior: ScenePrior) -> Measured:
             return measure_prior(
                 prior, scenes, num_steps=num_steps, seed=seed, pool=pool, prompts=prompts, guidance=config.guidance,
-                claim_guidance=config.claim_guidance, slots=slots, reward=reward,
+                slots=slots, reward=reward,
             )  # fmt: skip
 
         say(f"measuring {scenes} samples of the base prior, then of the post-trained one")
@@ -178,7 +178,6 @@ def measure_prior(
     pool: PhysicsPool | None = None,
     prompts: Sequence[str] | None = None,
     guidance: float = 0.0,
-    claim_guidance: float = 0.0,
     slots: int | None = None,
     reward: Any = None,
 ) -> Measured:
@@ -189,9 +188,8 @@ def measure_prior(
     from scene_envs.physics import feasibility, make_ready
 
     raw = prior.sample(
-        count, prompt=prompts, guidance=guidance, claim_guidance=claim_guidance, physics_guidance=0.0,
-        num_steps=num_steps, slots=slots, seed=seed,
-    ).to("cpu")  # fmt: skip
+        count, prompt=prompts, guidance=guidance, physics_guidance=0.0, num_steps=num_steps, slots=slots, seed=seed
+    ).to("cpu")
     left_out: dict[str, str] = {}
     ready: ReadyResult | None = None
     scored: RewardOutput | None = None
@@ -338,7 +336,7 @@ def _page(result: PostTrainResult, before: Measured, after: Measured, metrics: M
         if (path := directory / f"{name}.safetensors").exists():
             pictures[name] = draw_gallery(SceneBatch.load(path), directory / f"{name}.png")
     reward, algorithm = reward_label(settings["reward"]), settings["algorithm"]["name"].upper().replace("_", "-")
-    first, last, guard = before.figures, after.figures, metrics["guard"]
+    first, last, guard, hold = before.figures, after.figures, metrics["guard"], metrics.get("hold")
     lead = (
         f"{metrics['iterations']} iterations of {algorithm} on {reward}, with the pretraining loss on real scenes as "
         f"regularisation. All numbers are means over {first['scenes']:.0f} fresh, seeded samples of each prior; none "
@@ -361,7 +359,7 @@ def _page(result: PostTrainResult, before: Measured, after: Measured, metrics: M
     caption = f"Mean {reward} of each batch, and the guard." + ("" if over is None else " Shaded: over-optimised.")
     sections = [
         Section("The curve", verdict, [Picture(directory / "curve.png", caption)]),
-        *hold_sections(metrics.get("hold")),
+        *([Section("What was held", hold["verdict"])] if hold and hold["measured"] is not None else []),
         *guard_sections(guard, pictures),
         Section(
             "As sampled",
@@ -415,11 +413,6 @@ def guard_sections(guard: Mapping[str, Any], pictures: Mapping[str, Path]) -> li
     shown = [Picture(pictures[name], caption) for name, caption in captions.items() if name in pictures]
     text = "Each check sampled from the same noise, and compared the samples with held-out real scenes."
     return [Section("What the guard sampled", text, shown, table=rows)]
-
-
-def hold_sections(hold: Mapping[str, Any] | None) -> list[Section]:
-    """A section that says whether the target was held; none for a run without a target."""
-    return [] if hold is None or hold["measured"] is None else [Section("What was held", hold["verdict"])]
 
 
 def number_rows(columns: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:

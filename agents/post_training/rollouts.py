@@ -17,7 +17,6 @@ from torch import Generator, Tensor
 from agents.networks.text import Text
 from agents.post_training.algorithms.base import at_all_steps, final_reward
 from agents.post_training.policy import DenoisingPolicy
-from agents.priors.guidance import Hook
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import derived_seed
 from agents.utils.process_group import ProcessGroup, gather_rows
@@ -54,14 +53,13 @@ class SeededPolicy(TensorDictModuleBase):
 
     It reads and writes the keys of ``policy``, but for ``action_log_prob``. All episodes start at its first call. The
     prompts are encoded once, at the first step; ``text`` has their tokens (B, L, W) and mask (B, L), None for a prior
-    that reads none. ``seed`` is that of the run, ``iteration`` the number of the batch in it, from 0, and ``hook``
-    changes the distributions as :meth:`DenoisingPolicy.claim_hook` makes it.
+    that reads none. ``seed`` is that of the run, and ``iteration`` the number of the batch in it, from 0.
     """
 
-    def __init__(self, policy: DenoisingPolicy, seed: int, iteration: int = 0, hook: Hook | None = None) -> None:
+    def __init__(self, policy: DenoisingPolicy, seed: int, iteration: int = 0) -> None:
         super().__init__()
         self.in_keys, self.out_keys = policy.in_keys, ["action", "slot_log_prob"]
-        self.policy, self.hook, self.iteration = policy, hook, iteration
+        self.policy, self.iteration = policy, iteration
         self.text: Text | None = None
         self._seed, self._step = stream_seed(seed, "noise", iteration), 0
 
@@ -78,9 +76,7 @@ class SeededPolicy(TensorDictModuleBase):
             self.text = self.policy.read(tensordict["prompt"]) if "prompt" in self.in_keys else None
         count = processes.size * len(scene)
         noise = torch.randn(count, *scene.shape[1:], generator=self._generator, device=scene.device)
-        action, log_prob = self.policy.draw(
-            scene, step, text=self.text, noise=noise[processes.rows(count)], hook=self.hook
-        )
+        action, log_prob = self.policy.draw(scene, step, text=self.text, noise=noise[processes.rows(count)])
         if not bool(torch.isfinite(log_prob).all()):
             raise TrainingError(
                 f"the prior gave values that are not finite at step {step} of iteration {self.iteration + 1}; "
@@ -124,7 +120,7 @@ def collect(
     for timestep in core.table.timesteps.tolist():
         policy.step_of(timestep)  # raises where environment and policy have other steps
     env.set_seed(stream_seed(seed, "start", iteration) + rank * core.num_envs)
-    seeded = SeededPolicy(policy, seed, iteration, policy.claim_hook(prompts, core.slots))
+    seeded = SeededPolicy(policy, seed, iteration)
     start = env.reset(prompts=prompts)
     batch: TensorDict = env.rollout(core.num_steps, seeded, auto_reset=False, tensordict=start)
     entries = _verdict(env)

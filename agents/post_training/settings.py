@@ -15,7 +15,6 @@ from agents.configuration.composition import (
     OptimizerSettings,
     ProgressKeys,
     RewardLimitKeys,
-    SamplingKeys,
     TrainingKeys,
     composed,
     named,
@@ -23,7 +22,7 @@ from agents.configuration.composition import (
     plain_tree,
 )
 from agents.utils.loggers import LOGGERS
-from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance, check_guidance
+from scene_envs.envs.settings import PROMPT_SOURCES, check_guidance
 from scene_envs.errors import (
     BELOW_ONE,
     Checked,
@@ -34,13 +33,13 @@ from scene_envs.errors import (
     Nonnegative,
     OneOf,
     Positive,
+    Seed,
     Unlimited,
     at_least,
 )
 from scene_envs.registry import Registry
 
 CREDITS = ("auto", "scene", "object")
-CATEGORY_CREDITS = ("auto", "scene", "none")
 
 
 @dataclass
@@ -131,7 +130,7 @@ class ForwardProcessSettings(AlgorithmSettings):
     updates: Count = 2
     draws: Count = 2
     credit: Annotated[str, OneOf(CREDITS)] = "auto"
-    category_credit: Annotated[str, OneOf(CATEGORY_CREDITS)] = "auto"
+    category_credit: Annotated[str, OneOf(("auto", "scene", "none"))] = "auto"
     sampler_decay: Annotated[float, BELOW_ONE] = 0.9
     advantage_clip: Unlimited = 2.0
     expectation_lr: Annotated[float, at_least(0)] = 3e-4
@@ -245,30 +244,6 @@ def make_algorithm(settings: AlgorithmSettings, policy: Any, stds: Any) -> Any:
     return code(settings, policy, stds)
 
 
-def held_ratio(text: str) -> float:
-    """Ratio of the held-out loss to the base prior's that a text ``guard:RATIO`` names; an InvalidInputError for
-    another form, or a ratio that is not above 1.
-
-    >>> held_ratio("guard:1.05")
-    1.05
-    """
-    figure, _, number = text.partition(":")
-    try:
-        ratio = float(number) if figure == "guard" else math.nan
-    except ValueError:
-        ratio = math.nan
-    if not 1 < ratio < math.inf:
-        raise InvalidInputError(
-            f"hold={text!r} must be guard:RATIO, a finite ratio of held-out losses above 1, the base prior's, such as "
-            "guard:1.05"
-        )
-    return ratio
-
-
-OBJECTIVES = ("pretraining", "discriminative")
-"""Losses of the regularisation."""
-
-
 @dataclass
 class RegularisationSettings(Checked):
     """Settings of the regularisation: pretraining loss on real scenes.
@@ -278,8 +253,8 @@ class RegularisationSettings(Checked):
             real scenes relative to the base prior and lowers that of samples of the base prior.
         weight: coefficient of this loss; null takes the default of the algorithm.
         base_samples: number of samples of the base prior in the discriminative loss; they are drawn once.
-        hold: target that the run holds by adjusting the coefficient: ``guard:1.05`` is the held-out loss as a ratio to
-            the base prior's; null keeps the coefficient constant.
+        hold: held-out loss, as a ratio to the base prior's, that the run holds by adjusting the coefficient, such as
+            1.05; null keeps the coefficient constant.
         batch_size: real scenes per update.
         scenes: source of the real scenes: ``grammar``, or a dataset folder.
         bank_size: number of real scenes that are drawn from the grammar or read from the dataset, including the
@@ -288,23 +263,18 @@ class RegularisationSettings(Checked):
 
     place = "regularisation."
 
-    objective: Annotated[str, OneOf(OBJECTIVES)] = "pretraining"
+    objective: Annotated[str, OneOf(("pretraining", "discriminative"))] = "pretraining"
     weight: Annotated[float, at_least(0)] | None = None
     base_samples: Count = 1024
-    hold: str | None = None
+    hold: Annotated[float, Limit(lambda ratio: 1 < ratio < math.inf, "must be a finite ratio above 1")] | None = None
     batch_size: Count = 48
     scenes: str = "grammar"
     bank_size: int = 4096
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.target is not None and self.weight == 0:
-            raise InvalidInputError(f"hold={self.hold} adjusts regularisation.weight, which is 0; give a weight")
-
-    @property
-    def target(self) -> float | None:
-        """Ratio of the held-out loss to the base prior's that ``hold`` names."""
-        return None if self.hold is None else held_ratio(self.hold)
+        if self.hold is not None and self.weight == 0:
+            raise InvalidInputError(f"hold={self.hold:g} adjusts regularisation.weight, which is 0; give a weight")
 
 
 RESUMABLE = ("recipe", "iterations", "output", "workers", "logger", "progress", "reward_limits")
@@ -399,22 +369,9 @@ class PostTrainLoggerSettings(LoggerSettings):
     report_scenes: Natural = 256
 
 
-@dataclass
-class BatchKeys:
-    """Batches of fresh scenes.
-
-    :class:`PostTrainConfig` describes the keys.
-    """
-
-    iterations: Count = 60
-    batch_size: Annotated[int, at_least(2)] = 48
-    workers: Any = 0
-    physics: str = "auto"
-
-
 @composed
 @dataclass
-class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, RewardLimitKeys):
+class PostTrainConfig(TrainingKeys, ProgressKeys, RewardLimitKeys):
     """One post-training run.
 
     With DDPO-SF, the gradient that AdamW sees is that of
@@ -425,8 +382,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
     where ``step_scale = steps with weight > 0 / gradient_steps``. log p is a mean over the random entries of a scene,
     and the pretraining loss is a mean over scenes and entries. The weight is meaningful only with these reductions.
 
-    Keys that are not listed are those of :class:`~agents.configuration.composition.SamplingKeys`,
-    :class:`~agents.configuration.composition.TrainingKeys` and
+    Keys that are not listed are those of :class:`~agents.configuration.composition.TrainingKeys` and
     :class:`~agents.configuration.composition.RewardLimitKeys`.
 
     Attributes:
@@ -444,9 +400,9 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         prompt: text that the scenes should match, for priors that read prompts: one text, a list such as '["A scene
             with two cups.", "A scene with 9 objects."]', ``data`` for the prompts of the real scenes, or ``grammar``
             for descriptions of grammar scenes; null for no prompt.
+        num_steps: denoising steps per scene.
+        slots: slots per scene, which may exceed the number in training; null takes the number in training.
         guidance: weight of classifier-free guidance in the policy, 0 for none; needs a prompt.
-        claim_guidance: strength with which sampled scenes are guided to the numbers and places that their prompts
-            give, 0 for none; 2 is a good choice; needs a prompt, and an algorithm that learns from finished samples.
         seed: seed of the initial noise, the chain's noise, the choice of steps and the real scenes.
         algorithm: the post-training algorithm.
         optimizer: the optimiser of the weights.
@@ -455,9 +411,16 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         logger: log files and report.
     """
 
+    iterations: Count = 60
+    batch_size: Annotated[int, at_least(2)] = 48
+    workers: Any = 0
+    physics: str = "auto"
+    guidance: float = 0.0
+    slots: Count | None = None
+    seed: Seed = 0
     prior: str = "dimsum_table"
     reward: Any = named("object_count", "reward")
-    prompt: str | list[str] | None = None  # type: ignore[assignment]
+    prompt: str | list[str] | None = None
     num_steps: Count = 25
     algorithm: AlgorithmSettings = nested(
         DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
@@ -480,22 +443,15 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt)
         check_guidance(self.prompt, self.guidance)
-        check_claim_guidance(self.prompt, self.claim_guidance)
-        if self.claim_guidance and isinstance(self.algorithm, DDPOSFSettings):
-            raise InvalidInputError(
-                f"claim_guidance={self.claim_guidance:g} changes how scenes are drawn, and "
-                f"algorithm={self.algorithm.name} learns from the probability of its own draws; take algorithm=nft or "
-                "awm, or leave claim_guidance=0"
-            )
         if self.optimizer.lr is None:
             self.optimizer = replace(self.optimizer, lr=self.algorithm.learning_rate)
         if self.regularisation.weight is None:
             self.regularisation = replace(self.regularisation, weight=self.algorithm.regularisation_weight)
-        target = self.regularisation.target
-        if target is not None and target > self.guard.limit:
+        hold, limit = self.regularisation.hold, self.guard.limit
+        if hold is not None and hold > limit:
             raise InvalidInputError(
-                f"hold={self.regularisation.hold} lies beyond guard.limit={self.guard.limit:g}, past which no prior is "
-                f"kept; raise guard.limit, or hold at most guard:{self.guard.limit:g}"
+                f"hold={hold:g} lies beyond guard.limit={limit:g}, past which no prior is kept; raise guard.limit, or "
+                f"hold at most {limit:g}"
             )
         if self.regularisation.bank_size < self.guard.scenes + 1:
             raise InvalidInputError(

@@ -138,10 +138,7 @@ class PostTrainer:
         self._base: ScenePrior | None = base  # until the guard has measured it
         self.base_name = short_name(base.loaded_as) if base.loaded_as else ""
         self.prior = deepcopy(base).eval()
-        policy = DenoisingPolicy(
-            self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance,
-            claim_guidance=config.claim_guidance,
-        )  # fmt: skip
+        policy = DenoisingPolicy(self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance)
         self.learner = Learner(
             policy, config.resolved_reward(), config.algorithm, config.optimizer, config.regularisation,
             batch_size=config.batch_size, slots=config.slots, prompt=config.prompt, workers=config.workers,
@@ -270,9 +267,8 @@ class PostTrainer:
                 slots,
                 None if config.prompt is None else scenes.heldout_prompts(count, slots, self.prior.scene_type),
                 config.guidance,
-                config.claim_guidance,
             )
-        target = config.regularisation.target
+        target = config.regularisation.hold
         return Guard(
             scenes.heldout,
             config.guard.limit,

@@ -112,7 +112,7 @@ def _losses() -> tuple[Row, ...]:
 
 def _counts() -> tuple[Row, ...]:
     """The paper's figure: the number of objects on Living Room Shelf with 20 extra slots, and on Dimsum."""
-    hold = "regularisation.hold=guard:1.05"
+    hold = "regularisation.hold=1.05"
     return (
         Row("living_room_shelf-count-0", "living_room_shelf",
             (*_keys(CHAIN, "object_count", 0), "slots=43", hold), 80, slots=43),
@@ -123,16 +123,14 @@ def _counts() -> tuple[Row, ...]:
 
 
 def _prompts() -> tuple[Row, ...]:
-    """Prompts as reward, feasibility, and feasibility where the prompt is followed; with and without claim guidance."""
+    """Prompts as reward, feasibility, and feasibility where the prompt is followed."""
     gated = "reward={name: gate, reward: feasible_share, condition: prompt_match, threshold: 1}"
     rewards = {"match": "reward=prompt_match", "feasible": "reward=feasible_share", "gate": gated}
     return tuple(
-        Row(f"{prior}-{how}{label}-0", prior,
-            (f"algorithm={FORWARD}", reward, "prompt=grammar", "seed=0", f"claim_guidance={strength}"), 60)
+        Row(f"{prior}-{label}-0", prior, (f"algorithm={FORWARD}", reward, "prompt=grammar", "seed=0"), 60)
         for prior in ("dimsum_table", "restaurant_low_clutter")
-        for how, strength in (("", 0), ("guided_", 2))
         for label, reward in rewards.items()
-    )  # fmt: skip
+    )
 
 
 def _realism() -> tuple[Row, ...]:

@@ -52,7 +52,7 @@ RESUMABLE = {
     "post-train nft": Command(
         ("post-train", _PRIORS[1], *_TRAINING, "algorithm=nft", "guard.samples=2", "guard.action=rollback"), _TRAINED
     ),
-    "post-train hold": Command(("post-train", _PRIORS[0], *_TRAINING, "regularisation.hold=guard:1.05"), _TRAINED),
+    "post-train hold": Command(("post-train", _PRIORS[0], *_TRAINING, "regularisation.hold=1.05"), _TRAINED),
     "search": Command(("search", _PRIORS[1], *_SEARCHING, "budget=24"), _SEARCHED),
     "search count": Command(
         ("search", _PRIORS[1], *_SEARCHING, "budget=9", "planner=mcts", "count=4", "side_by_side=2"), _SEARCHED

@@ -6,7 +6,6 @@ import csv
 import json
 import os
 import signal
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from agents.diffusion.reverse_steps import concatenate_steps
 from agents.post_training import (
     DDPOSFLoss,
     DenoisingPolicy,
-    PostTrainConfig,
     PostTrainer,
     compute_advantages,
     post_train,
@@ -29,7 +27,7 @@ from agents.post_training import (
 from agents.post_training import learner as learner_module
 from agents.post_training import regularisation as regularisation_module
 from agents.post_training.doctor import diagnose
-from agents.post_training.rollouts import PromptDeck, collect, finished_scenes, text_of
+from agents.post_training.rollouts import PromptDeck, collect, text_of
 from agents.post_training.run_files import SCENES_NAME
 from agents.priors.mixed import MixedPrior
 from agents.priors.prior import ScenePrior
@@ -388,69 +386,14 @@ def test_a_reward_that_reads_one_kind_of_prompts_alone_is_not_refused(
         post_train(config, prior=tiny_prior(process="mixed", text=True))
 
 
-NINE_AND_TWENTY = ["A scene with nine objects.", "A scene with 20 objects."]
-
-
-def guided_reader() -> ScenePrior:
-    return tiny_prior(process="mixed", text=True, kernel="squared_absorbing")
-
-
-def guided_config(output: Path, **changes: Any) -> PostTrainConfig:
-    keys: dict[str, Any] = {
-        "algorithm": {"name": "nft", "scenes_per_prompt": 4},
-        "optimizer": {"lr": 1e-3},
-        "guard": {"scenes": 24, "samples": 20, "every": 2, "samples_every": 2},
-    }
-    regularisation = {"weight": 1.0, "batch_size": 4, "bank_size": 32}
-    return PostTrainConfig(
-        reward=count_objects, prompt=NINE_AND_TWENTY, claim_guidance=1.0, iterations=2, batch_size=8, num_steps=20,
-        regularisation=regularisation, progress="none", output=str(output), **(keys | changes),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("chunk", [None, 3])
-def test_the_scenes_of_a_batch_hold_the_numbers_of_their_prompts(tmp_path: Path, chunk: int | None) -> None:
-    algorithm = {"name": "nft", "scenes_per_prompt": 4}
-    trainer = PostTrainer(
-        guided_config(tmp_path, algorithm=algorithm, optimizer={"lr": 1e-3, "chunk": chunk}), prior=guided_reader()
-    )
-    trainer.prepare()
-    scenes, prompts = finished_scenes(trainer.learner.rollout(0)), trainer.learner.env.core.prompts
-    trainer.close()
-    assert prompts is not None
-    assert scenes.counts.tolist() == [{NINE_AND_TWENTY[0]: 9, NINE_AND_TWENTY[1]: 20}[prompt] for prompt in prompts]
-
-
-def test_the_guard_samples_as_the_run_does(tmp_path: Path) -> None:
-    trainer = PostTrainer(guided_config(tmp_path), prior=guided_reader())
-    trainer.prepare()
-    check = trainer.guard.samples
-    trainer.close()
-    assert check is not None
-    guided = replace(check, prompts=NINE_AND_TWENTY * 10).sample(guided_reader())
-    assert guided.counts.tolist() == [9, 20] * 10
-
-
 def test_steps_of_chunks_keep_the_scenes_that_the_network_expects() -> None:
-    prior = guided_reader()
+    prior = tiny_prior(process="mixed", text=True, kernel="squared_absorbing")
     step = prior.transition(prior.initial(3, 34), 5, prior.step_table(20))
     joined = concatenate_steps([step, step])
     assert joined.denoised is not None
     assert step.denoised is not None
     torch.testing.assert_close(joined.denoised, torch.cat([step.denoised, step.denoised]))
     assert concatenate_steps([step, step.take(torch.arange(3))]).denoised is None
-
-
-@pytest.mark.parametrize("algorithm", ["ddpo_sf", "ddpo_is"])
-def test_algorithms_that_need_log_probabilities_are_refused(tmp_path: Path, algorithm: str) -> None:
-    with pytest.raises(InvalidInputError, match=rf"claim_guidance=1 .*algorithm={algorithm} .*algorithm=nft or awm"):
-        guided_config(tmp_path, algorithm={"name": algorithm})
-
-
-@pytest.mark.parametrize("prompt", [None, ""])
-def test_guidance_without_prompts_is_refused(prompt: str | None) -> None:
-    with pytest.raises(InvalidInputError, match="prompt"):
-        PostTrainConfig(prompt=prompt, claim_guidance=1.0, algorithm={"name": "nft"})
 
 
 TWO = ["A scene with two cups.", "A scene with 20 objects."]

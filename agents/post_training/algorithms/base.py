@@ -91,10 +91,9 @@ class AveragedSampler(Algorithm):
         self.policy = policy
         self.prior: ScenePrior = policy.prior  # type: ignore[assignment]
         self.sampler = deepcopy(self.prior).eval().requires_grad_(False)
-        self.sampling_policy = DenoisingPolicy(
-            self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance,
-            claim_guidance=policy.claim_guidance, independent=False,
-        )  # fmt: skip  # it needs no log-probabilities
+        self.sampling_policy = DenoisingPolicy(  # it needs no log-probabilities
+            self.sampler, len(policy), chunk=policy.chunk, guidance=policy.guidance, independent=False
+        )
         self.average = WeightAverage(self.prior, sampler_decay, warm_up)
 
     def end_iteration(self) -> None:

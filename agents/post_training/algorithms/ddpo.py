@@ -166,9 +166,7 @@ class DDPO(Algorithm):
         self.advantage = Advantage(credit=settings.credit)
         weights = gradient_weights(stds, min_std=settings.min_std)
         clip = settings.clip_epsilon if isinstance(settings, DDPOISSettings) else None
-        self.loss = DDPOSFLoss(policy, step_weights=weights, clip_epsilon=clip).to(
-            next(policy.parameters()).device
-        )
+        self.loss = DDPOSFLoss(policy, step_weights=weights, clip_epsilon=clip).to(next(policy.parameters()).device)
 
     def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that enter it."""
