@@ -18,7 +18,7 @@ from agents.post_training.report import (
     Picture,
     Section,
     Tile,
-    draw_side_by_side,
+    draw_scenes,
     measure_prior,
     number_rows,
     ready_section,
@@ -122,10 +122,11 @@ def _page(directory: Path, results: Mapping[str, _Finished], measured: Mapping[s
             Tile(f"{name}: feasible as sampled", _share(after), f"of free objects, from {_share(before)}"),
             Tile(f"{name}: held-out loss", f"{ratio:.2f}×", "of the base prior"),
         ]
-    raw = draw_side_by_side(measured, directory / "samples.png")
+    raw = draw_scenes({name: (part.raw, None) for name, part in measured.items()}, directory / "samples.png")
     columns, ready, left_out = "Columns: " + ", ".join(measured), [], _left_out(measured)
     if "feasible" not in left_out:
-        ready = [Picture(draw_side_by_side(measured, directory / "ready.png", ready=True), columns)]
+        shown = {name: (part.ready, part.is_ready) for name, part in measured.items() if part.ready is not None}
+        ready = [Picture(draw_scenes(shown, directory / "ready.png"), columns)]
     count = int(before["scenes"])
     sections = [
         Section(

@@ -238,28 +238,13 @@ def _standard_error(values: Tensor) -> float:
     return float(values.std(unbiased=True) / len(values) ** 0.5) if len(values) > 1 else 0.0
 
 
-def draw_gallery(batch: SceneBatch, path: Path, is_ready: Tensor | None = None) -> Path:
-    """Draw the first scenes of ``batch`` with their counts as a PNG; with ``is_ready`` (B, N), captions count these
-    objects, and the other free objects are red.
+def draw_scenes(shown: Mapping[str, tuple[SceneBatch, Tensor | None]], path: Path) -> Path:
+    """Draw the first scenes of up to three batches, by the names in their captions, as a PNG: several have a column
+    each. With (B, N) bool whether objects are ready, captions count these, and the other free objects are red.
     """
-    return _draw_columns({"": (batch, is_ready)}, path, _GALLERY)
-
-
-def draw_side_by_side(measured: Mapping[str, Measured], path: Path, *, ready: bool = False) -> Path:
-    """Draw the first scenes of up to three priors, by caption and from the same noise, as a PNG: a row per scene, a
-    column per prior. ``ready`` shows them after projection and settling, with objects that are not ready in red.
-    """
-    if ready:
-        shown = {name: (part.ready, part.is_ready) for name, part in measured.items() if part.ready is not None}
-    else:
-        shown = {name: (part.raw, None) for name, part in measured.items()}
-    return _draw_columns(shown, path, _GALLERY // 2)
-
-
-def _draw_columns(shown: Mapping[str, tuple[SceneBatch, Tensor | None]], path: Path, count: int) -> Path:
-    """Draw the first ``count`` scenes of batches, in columns if there are several, with names in their captions."""
     from scene_envs.render import gallery, render
 
+    count = _GALLERY if len(shown) == 1 else _GALLERY // 2
     drawn: list[list[tuple[NDArray[np.uint8], str]]] = []
     for name, (batch, is_ready) in shown.items():
         batch, free = batch[:count], batch[:count].is_free.cpu()
@@ -329,12 +314,13 @@ def _page(result: PostTrainResult, before: Measured, after: Measured, metrics: M
     directory, settings = result.directory, result.config.plain()
     pictures = {}
     for name, part in {"before": before, "after": after}.items():
-        pictures[name] = draw_gallery(part.raw, directory / f"{name}.png")
+        pictures[name] = draw_scenes({"": (part.raw, None)}, directory / f"{name}.png")
         if part.ready is not None:
-            pictures[f"{name}_ready"] = draw_gallery(part.ready, directory / f"{name}_ready.png", part.is_ready)
+            path = directory / f"{name}_ready.png"
+            pictures[f"{name}_ready"] = draw_scenes({"": (part.ready, part.is_ready)}, path)
     for name in ("guard_within", "guard_beyond"):
         if (path := directory / f"{name}.safetensors").exists():
-            pictures[name] = draw_gallery(SceneBatch.load(path), directory / f"{name}.png")
+            pictures[name] = draw_scenes({"": (SceneBatch.load(path), None)}, directory / f"{name}.png")
     reward, algorithm = reward_label(settings["reward"]), settings["algorithm"]["name"].upper().replace("_", "-")
     first, last, guard, hold = before.figures, after.figures, metrics["guard"], metrics.get("hold")
     lead = (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -266,7 +265,7 @@ class RegularisationSettings(Checked):
     objective: Annotated[str, OneOf(("pretraining", "discriminative"))] = "pretraining"
     weight: Annotated[float, at_least(0)] | None = None
     base_samples: Count = 1024
-    hold: Annotated[float, Limit(lambda ratio: 1 < ratio < math.inf, "must be a finite ratio above 1")] | None = None
+    hold: Annotated[float, Limit(lambda ratio: ratio > 1, "must be a ratio above 1")] | None = None
     batch_size: Count = 48
     scenes: str = "grammar"
     bank_size: int = 4096

@@ -103,11 +103,15 @@ def _equal_scenes() -> tuple[Row, ...]:
 def _losses() -> tuple[Row, ...]:
     """Every loss after 960 sampled scenes of Dimsum, the losses of ``examples/`` too: two rewards, three seeds."""
     return tuple(
-        Row(f"dimsum_table-{name}-{reward}-{seed}", "dimsum_table", (*_keys(name, reward, seed), *_LAST), 40)
+        Row(f"dimsum_table-{name}-{reward}-{seed}", "dimsum_table",
+            (*_keys(algorithm, reward, seed), *more, *_LAST), 40)
         for seed in range(3)
         for reward in ("feasible_share", "object_count")
-        for name in (FORWARD, "awm", CHAIN, "ddpo_is", DISTILLATION, *PLUG_INS)
-    )
+        for name, algorithm, more in (
+            *((name, name, ()) for name in (FORWARD, "awm", CHAIN, "ddpo_is", DISTILLATION, *PLUG_INS)),
+            ("udm_grpo_averaged", "udm_grpo", ("algorithm.sampler_decay=0.9", "algorithm.expectation_lr=3e-4")),
+        )
+    )  # fmt: skip
 
 
 def _counts() -> tuple[Row, ...]:

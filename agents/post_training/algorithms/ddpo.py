@@ -170,15 +170,10 @@ class DDPO(Algorithm):
 
     def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
         """Add the policy gradient of a batch to ``.grad``; ``generator`` draws the steps that enter it."""
-        steps, scale = draw_steps(self.loss.step_weights.cpu(), self.settings.gradient_steps, generator)
-        return accumulate_policy_gradient(self.loss, batch, steps, scale=scale)
-
-
-def draw_steps(weights: Tensor, count: int, generator: Generator) -> tuple[list[int], float]:
-    """``count`` distinct steps of positive weight, and the factor that scales their sum to all such steps."""
-    eligible = torch.nonzero(weights > 0).flatten()
-    chosen = eligible[torch.randperm(len(eligible), generator=generator)[:count]]
-    return sorted(chosen.tolist()), len(eligible) / len(chosen)
+        eligible = torch.nonzero(self.loss.step_weights.cpu() > 0).flatten()
+        chosen = eligible[torch.randperm(len(eligible), generator=generator)[: self.settings.gradient_steps]]
+        scale = len(eligible) / len(chosen)  # of the sum over these steps to that over all
+        return accumulate_policy_gradient(self.loss, batch, sorted(chosen.tolist()), scale=scale)
 
 
 def accumulate_policy_gradient(
