@@ -106,7 +106,7 @@ class CRD(ForwardProcess):
         """The loss of these settings, with the reference and the base prior that it compares with."""
         loss = CRDLoss(self.prior, deepcopy(self.sampler), beta=settings.beta, clip=settings.advantage_clip)
         loss.anchor, loss.floor, loss.guidance = settings.anchor, settings.floor, self.policy.guidance
-        loss.base = deepcopy(self.sampler)
+        loss.base, loss.expectation = deepcopy(self.sampler), self.expectation
         return loss
 
     def end_iteration(self) -> None:

@@ -110,6 +110,7 @@ def _losses() -> tuple[Row, ...]:
         for name, algorithm, more in (
             *((name, name, ()) for name in (FORWARD, "awm", CHAIN, "ddpo_is", DISTILLATION, *PLUG_INS)),
             ("udm_grpo_averaged", "udm_grpo", ("algorithm.sampler_decay=0.9", "algorithm.expectation_lr=3e-4")),
+            ("crd_averaged", "crd", ("algorithm.expectation_lr=3e-4",)),
         )
     )  # fmt: skip
 
