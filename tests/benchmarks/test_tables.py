@@ -30,6 +30,7 @@ from benchmarks.post_training.runs import guard_figures, measure, training_figur
 from rewards.registry import resolve_reward
 from scene_envs.datasets import generate
 from scene_envs.errors import InvalidInputError, UnknownNameError
+from scene_envs.registry import run_file
 
 STANDARD = dotted_values(PretrainConfig())
 
@@ -345,6 +346,10 @@ def test_every_kind_of_row_is_a_valid_run(table: str) -> None:
     kinds = {tuple(key for key in row.keys if not key.startswith("seed=")): row for row in TABLES[table].rows}
     for row in kinds.values():
         words = [f"prior={row.prior}", *row.keys, f"iterations={row.iterations}"]
+        algorithm, _, name = row.keys[0].partition(".py:")
+        if name:  # of a file, which the command runs
+            run_file(Path(f"{algorithm.removeprefix('algorithm=')}.py"))
+            words[1] = f"algorithm={name}"
         resolve_reward(compose("post-train", PostTrainConfig, words).reward)
 
 
