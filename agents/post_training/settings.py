@@ -16,6 +16,7 @@ from agents.configuration.composition import (
     ProgressKeys,
     RewardLimitKeys,
     SamplingKeys,
+    Texts,
     TrainingKeys,
     composed,
     named,
@@ -457,7 +458,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
 
     prior: str = "dimsum_table"
     reward: Any = named("object_count", "reward")
-    prompt: str | list[str] | None = None  # type: ignore[assignment]
+    prompt: Texts = None
     num_steps: Count = 25
     algorithm: AlgorithmSettings = nested(
         DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
