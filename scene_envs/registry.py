@@ -306,20 +306,12 @@ def register_envs() -> None:
     """Register every SceneEnvs environment with Gymnasium (idempotent)."""
     if "SceneEnvs/Denoising-v0" in gymnasium.registry:
         return
+    adapters, search = "scene_envs.envs.denoising_adapters", "scene_envs.envs.search_gymnasium"
     gymnasium.register(
-        id="SceneEnvs/Denoising-v0",
-        entry_point="scene_envs.envs.denoising_adapters:DenoisingEnv",
-        vector_entry_point="scene_envs.envs.denoising_adapters:DenoisingVectorEnv",
-        disable_env_checker=True,
-        order_enforce=True,
-    )
-    gymnasium.register(
-        id="SceneEnvs/Search-v0",
-        entry_point="scene_envs.envs.search_gymnasium:SearchEnv",
+        "SceneEnvs/Denoising-v0",
+        f"{adapters}:DenoisingEnv",
+        vector_entry_point=f"{adapters}:DenoisingVectorEnv",
         disable_env_checker=True,
     )
-    gymnasium.register(
-        id="SceneEnvs/SearchMask-v0",
-        entry_point="scene_envs.envs.search_gymnasium:SearchMaskEnv",
-        disable_env_checker=True,
-    )
+    gymnasium.register("SceneEnvs/Search-v0", f"{search}:SearchEnv", disable_env_checker=True)
+    gymnasium.register("SceneEnvs/SearchMask-v0", f"{search}:SearchMaskEnv", disable_env_checker=True)
