@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import inspect
 import shutil
-import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import NoneType
@@ -23,6 +23,7 @@ from agents.configuration.composition import (
     group_options,
     hint_of,
     merged,
+    parse_config,
     verbatim,
 )
 from agents.configuration.prior_names import adapted_name
@@ -153,17 +154,13 @@ def _heading(field: dataclasses.Field[Any], chosen: str, config_dir: str) -> str
 def format_rows(rows: Sequence[tuple[str, str]]) -> str:
     """Two columns, the second wrapped to the terminal."""
     width = max(60, min(shutil.get_terminal_size().columns, 120))
-    left = min(34, max(len(name) for name, _ in rows)) + 4
-    lines = []
-    for name, meaning in rows:
-        wrapped = textwrap.wrap(meaning, width - left) or [""]
-        head = f"  {name}"
-        if len(head) > left - 2:
-            lines.append(head)
-            head = ""
-        lines.append(head.ljust(left) + wrapped[0])
-        lines.extend(" " * left + line for line in wrapped[1:])
-    return "\n".join(line.rstrip() for line in lines)
+    formatter = argparse.HelpFormatter("", max_help_position=38, width=width)
+    formatter.start_section(None)
+    formatter.add_arguments(
+        argparse.Action([], name, metavar=name, help=meaning.replace("%", "%%")) for name, meaning in rows
+    )
+    formatter.end_section()
+    return formatter.format_help().rstrip()
 
 
 def compose(command: str, config: type, words: Sequence[str], config_dir: str = "", config_file: str = "") -> Any:
@@ -225,17 +222,12 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
 
 def read_config(path: str) -> dict[str, Any]:
     """The values of a ``config.yaml``; an InvalidInputError without the file, a CorruptFileError without a mapping."""
-    import yaml
-
     try:
-        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        return parse_config(Path(path).read_text(encoding="utf-8"), f"--config {path}")
     except OSError as error:
         raise InvalidInputError(f"--config {path}: {error.strerror}; name the config.yaml of a run") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CorruptFileError(f"--config {path} is not YAML ({str(error).splitlines()[0]})") from error
-    if not isinstance(found, dict):
-        raise CorruptFileError(f"--config {path} holds no keys")
-    return found
+    except UnicodeDecodeError as error:
+        raise CorruptFileError(f"--config {path} is not YAML ({error})") from error
 
 
 def _is_option(field: dataclasses.Field[Any], key: str, value: str, config_dir: str) -> bool:

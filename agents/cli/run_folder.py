@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from agents.configuration.composition import config_text, dotted
+from agents.configuration.composition import config_text, dotted, parse_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import claimed, read_sealed, sealed, storage_error, write_json, write_text
 
@@ -125,18 +125,17 @@ class Run:
         return True
 
     def _check_keys(self) -> None:
-        import yaml
-
         path = self.directory / "config.yaml"
         try:
-            before = yaml.safe_load(read_sealed(path))
+            was = dotted(parse_config(read_sealed(path), repr(str(path))))
         except OSError:
             return
-        except (CorruptFileError, yaml.YAMLError) as error:
-            raise _unreadable(path, " ".join(str(error).split())) from error
-        if not isinstance(before, dict):
-            raise _unreadable(path, f"{str(path)!r} holds no keys")
-        was, is_now = dotted(before), dotted(yaml.safe_load(config_text(self.settings)))
+        except CorruptFileError as error:
+            raise CorruptFileError(
+                f"{error}, so whether {str(self.directory)!r} was written with these keys cannot be told; give another "
+                f"output, or remove {path.name} to write into the folder all the same"
+            ) from error
+        is_now = dotted(parse_config(config_text(self.settings), ""))
         changed = [
             f"{key} was {was[key]!r}, is {is_now[key]!r}"
             for key in is_now
@@ -206,13 +205,6 @@ class Run:
             logger.setLevel(logging.DEBUG)  # details for the file alone
             for handler in self._handlers:
                 logger.addHandler(handler)
-
-
-def _unreadable(path: Path, reason: str) -> CorruptFileError:
-    return CorruptFileError(
-        f"{reason}, so whether {str(path.parent)!r} was written with these keys cannot be told; give another output, "
-        f"or remove {path.name} to write into the folder all the same"
-    )
 
 
 def _writer(folder: Path) -> str | None:

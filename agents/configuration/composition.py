@@ -19,7 +19,17 @@ from types import NoneType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from agents.utils.loggers import LOGGERS
-from scene_envs.errors import Checked, Count, InvalidInputError, Natural, OneOf, Positive, Seed, unknown_name
+from scene_envs.errors import (
+    Checked,
+    CorruptFileError,
+    Count,
+    InvalidInputError,
+    Natural,
+    OneOf,
+    Positive,
+    Seed,
+    unknown_name,
+)
 from scene_envs.progress import STYLES
 from scene_envs.registry import load_plugins, plugin_entry_points
 
@@ -208,6 +218,19 @@ def config_text(values: Any) -> str:
     tree = plain_tree(values)
     own_first = [name for part in type(values).__mro__ for name in inspect.get_annotations(part) if name in tree]
     return yaml.safe_dump({key: tree[key] for key in [*own_first, *tree]}, sort_keys=False)
+
+
+def parse_config(text: str, place: str) -> dict[str, Any]:
+    """The values in the text of a ``config.yaml``; a CorruptFileError, which names its ``place``, without a mapping."""
+    import yaml
+
+    try:
+        found = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise CorruptFileError(f"{place} is not YAML ({str(error).splitlines()[0]})") from error
+    if not isinstance(found, dict):
+        raise CorruptFileError(f"{place} holds no keys")
+    return found
 
 
 def _refusal(hint: Any, value: Any, path: str) -> InvalidInputError:

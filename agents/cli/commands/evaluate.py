@@ -81,23 +81,19 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
 
 
 def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> list[str]:
-    """Names of groups, in their order, from ``"all"``, a name, names joined by commas, or a list of names; ``project``
-    says whether ``"all"`` includes ``ready``. An UnknownNameError for a name that is no group.
+    """Names of groups, in their order, from ``"all"``, a name, or a list of names; ``project`` says whether ``"all"``
+    includes ``ready``. An UnknownNameError for a name that is no group.
 
-    >>> choose_measures("novelty, layout")
+    >>> choose_measures(["novelty", "layout"])
     ['layout', 'novelty']
     """
-    if not isinstance(measures, str | Iterable):
+    names = [measures] if isinstance(measures, str) else measures
+    if not isinstance(names, Iterable) or not names:
         raise InvalidInputError(f"measures={measures!r} is no list of names; known: all, {', '.join(MEASURE_NAMES)}")
-    names = [name.strip() for name in measures.split(",")] if isinstance(measures, str) else [*map(str, measures)]
-    if "all" in names and all(name == "all" or name in MEASURE_NAMES for name in names):
-        return [name for name in MEASURE_NAMES if project or name != "ready"]
-    if not names:
-        raise InvalidInputError(f"measures is empty; give all, or some of {', '.join(MEASURE_NAMES)}")
     for name in names:
-        if name not in MEASURE_NAMES:
-            raise unknown_name("measure", name, ["all", *MEASURE_NAMES])
-    return [name for name in MEASURE_NAMES if name in names]
+        if name not in ("all", *MEASURE_NAMES):
+            raise unknown_name("measure", str(name), ["all", *MEASURE_NAMES])
+    return [name for name in MEASURE_NAMES if name in names or ("all" in names and (project or name != "ready"))]
 
 
 def check(settings: EvaluateConfig) -> None:
@@ -137,8 +133,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
         run.log(results.notes[-1])
     samples = results.scenes(_SAMPLES, lambda: draw(prior, settings, settings.count, batch_size=settings.batch_size))
     draw_scenes(samples, settings.pictures, run, "gallery.png")
-    asked = settings.measures.split(",") if isinstance(settings.measures, str) else settings.measures
-    optional = "all" in [str(name).strip() for name in asked]
+    optional = settings.measures == "all" or "all" in settings.measures
     with make_pool(settings.workers, physics=settings.physics) as pool:
         inputs = EvaluationInputs(
             samples,
