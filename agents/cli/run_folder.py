@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from agents.configuration.composition import config_text, dotted, parse_config
+from agents.configuration.composition import check_same_keys, config_text, parse_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import claimed, read_sealed, sealed, storage_error, write_json, write_text
 
@@ -127,7 +127,7 @@ class Run:
     def _check_keys(self) -> None:
         path = self.directory / "config.yaml"
         try:
-            was = dotted(parse_config(read_sealed(path), repr(str(path))))
+            before = parse_config(read_sealed(path), repr(str(path)))
         except OSError:
             return
         except CorruptFileError as error:
@@ -135,17 +135,7 @@ class Run:
                 f"{error}, so whether {str(self.directory)!r} was written with these keys cannot be told; give another "
                 f"output, or remove {path.name} to write into the folder all the same"
             ) from error
-        is_now = dotted(parse_config(config_text(self.settings), ""))
-        changed = [
-            f"{key} was {was[key]!r}, is {is_now[key]!r}"
-            for key in is_now
-            if key in was and was[key] != is_now[key] and key.partition(".")[0] not in _MAY_DIFFER
-        ]
-        if changed:
-            raise InvalidInputError(
-                f"output={str(self.directory)!r} was written with other keys ({'; '.join(changed)[:500]}); "
-                "give another output, or the same keys to write it again"
-            )
+        check_same_keys(self.directory, before, parse_config(config_text(self.settings), ""), _MAY_DIFFER)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -10,7 +10,7 @@ import math
 import re
 import sys
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from importlib.util import find_spec
@@ -198,6 +198,26 @@ def dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in tree.items():
         flat |= dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
     return flat
+
+
+def check_same_keys(
+    folder: Path, before: Mapping[str, Any], now: Mapping[str, Any], may_differ: Collection[str]
+) -> None:
+    """Refuse to go on in a folder that was written with other values of keys, but for those that ``may_differ``; keys
+    of only one of the two do not count.
+    """
+    heads = [key for key in now if key in before and key not in may_differ and before[key] != now[key]]
+    was, is_now = (dotted({key: values[key] for key in heads}) for values in (before, now))
+    told = [
+        f"{key} was {was.get(key)!r}, is {is_now.get(key)!r}"
+        for key in {**was, **is_now}
+        if was.get(key) != is_now.get(key)
+    ]
+    if told:
+        raise InvalidInputError(
+            f"output={str(folder)!r} was written with other keys ({'; '.join(told)[:500]}); give another output, or "
+            "the same keys to go on there"
+        )
 
 
 def plain_tree(value: Any) -> Any:

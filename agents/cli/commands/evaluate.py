@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior
 from agents.cli.run_folder import Run
-from agents.configuration.composition import MEASURE_NAMES, DrawKeys, OutputKeys
+from agents.configuration.composition import MEASURE_NAMES, DrawKeys, OutputKeys, check_same_keys
 from scene_envs.errors import (
     CorruptFileError,
     Count,
@@ -205,16 +205,11 @@ class _Results:
         changed = {key for key in {*known, *identity} if known.get(key) != identity.get(key)}
         if not changed:
             return
-        stale = [_PROMPTED] if changed & _OF_PROMPTS else []
+        check_same_keys(run.directory, known, identity, ("digest", *_OF_PROMPTS))
+        stale = [_PROMPTED]
         if known and changed <= _OF_PROMPTS:
-            if stale and self.groups.pop("prompts", None) is not None:
-                run.say(f"{path} has other {' and '.join(sorted(changed & _OF_PROMPTS))}: measuring the prompts anew")
-        elif known and changed != {"digest"}:
-            told = [f"{key} was {known.get(key)!r}, is {identity.get(key)!r}" for key in sorted(changed - {"digest"})]
-            raise InvalidInputError(
-                f"output={str(run.directory)!r} holds figures of other keys ({'; '.join(told)[:500]}); give another "
-                "output"
-            )
+            if self.groups.pop("prompts", None) is not None:
+                run.say(f"{path} has other {' and '.join(sorted(changed))}: measuring the prompts anew")
         else:
             self.groups, stale = {}, [_SAMPLES, _PROMPTED]
             if known:
