@@ -344,7 +344,8 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     kept = {"regularisation.scenes"} if resumed else set()  # a resumed run has them in its folder
     for key in set(_DATASETS) - kept - set(getattr(settings, "NO_PATHS", ())):
         _check_dataset(key, functools.reduce(lambda value, part: getattr(value, part, None), key.split("."), settings))
-    _check_guidance(settings)
+    if getattr(settings, "prompt", None) == "":
+        raise InvalidInputError("prompt= is empty; give a text, or null for no prompt")
     if (physics := getattr(settings, "physics", "auto")) != "auto":  # what auto takes is said in the log of the run
         from scene_envs.physics.engines import engine_name
 
@@ -382,16 +383,3 @@ def _check_dataset(key: str, value: Any) -> None:
             raise InvalidInputError(
                 f"{key}={value[:200]!r}: nothing is at {part[:200]!r}; name a dataset, as scene-envs generate makes one"
             )
-
-
-def _check_guidance(settings: Any) -> None:
-    from agents.post_training.settings import check_prompt
-    from scene_envs.envs.settings import check_claim_guidance, check_guidance, check_physics_guidance
-
-    prompt = getattr(settings, "prompt", "those of real scenes")
-    check_prompt(prompt)
-    check_guidance(prompt, getattr(settings, "guidance", 0.0))
-    if strength := getattr(settings, "claim_guidance", 0.0):
-        check_claim_guidance(prompt, strength)
-    if strength := getattr(settings, "physics_guidance", 0.0):
-        check_physics_guidance(strength)

@@ -19,11 +19,13 @@ from types import NoneType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from agents.utils.loggers import LOGGERS
+from scene_envs.envs.settings import check_claim_guidance, check_guidance
 from scene_envs.errors import (
     Checked,
     CorruptFileError,
     Count,
     InvalidInputError,
+    Limit,
     Natural,
     OneOf,
     Positive,
@@ -569,6 +571,11 @@ class PromptKeys(Checked):
     guidance: float = 0.0
     claim_guidance: float = 0.0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_guidance(self.prompt, self.guidance)
+        check_claim_guidance(self.prompt, self.claim_guidance)
+
 
 @dataclass
 class SamplingKeys(PromptKeys):
@@ -585,6 +592,9 @@ class SamplingKeys(PromptKeys):
     seed: Seed = 0
 
 
+PhysicsGuidance = Annotated[float, Limit(lambda value: 0 <= value <= 1, "must be a number from 0 to 1")]
+
+
 @dataclass
 class DrawKeys(PrecisionKeys, DeviceKeys):
     """Samples of a prior.
@@ -597,7 +607,7 @@ class DrawKeys(PrecisionKeys, DeviceKeys):
     """
 
     num_steps: Count = 50
-    physics_guidance: float | None = None
+    physics_guidance: PhysicsGuidance | None = None
     seed: Seed = 0
 
 

@@ -301,7 +301,7 @@ LINES = {
     "sample claim_guidance=2": "claim_guidance=2 guides scenes to the claims of a prompt",
     "search claim_guidance=2": "give prompt=, or leave claim_guidance=0",
     "rearrange prior=dimsum_table claim_guidance=-1": "claim_guidance=-1.0 must be a finite number",
-    "evaluate claim_guidance=nan": "claim_guidance=nan must be a finite number",
+    "evaluate claim_guidance=nan": "claim_guidance=nan must be at least 0",
     "sample physics_guidance=2": "physics_guidance=2.0 must be a number from 0 to 1",
     "search physics_guidance=-1": "physics_guidance=-1.0 must be a number from 0 to 1",
     "complete prior=dimsum_table physics_guidance=nan": "physics_guidance=nan must be a number from 0 to 1",

@@ -13,6 +13,7 @@ from agents.cli.commands.scenes import draw, draw_scenes, load_prior
 from agents.cli.run_folder import Run
 from agents.configuration.composition import MEASURE_NAMES, DrawKeys, OutputKeys, check_same_keys
 from scene_envs.errors import (
+    FINITE,
     CorruptFileError,
     Count,
     InvalidInputError,
@@ -73,8 +74,8 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
     prior: str = "dimsum_table"
     count: Annotated[int, at_least(2)] = 200
     prompt_count: int | None = None
-    guidance: float = 0.0
-    claim_guidance: float = 0.0
+    guidance: Annotated[float, FINITE] = 0.0
+    claim_guidance: Annotated[float, at_least(0)] = 0.0
     measures: Any = "all"
     project: bool = True
     pictures: Natural = 16
