@@ -28,7 +28,6 @@ from agents.configuration.composition import (
     config_text,
     known_masks,
     known_rewards,
-    known_scenes,
 )
 from agents.configuration.prior_names import find_prior, split_name
 from agents.utils.interrupts import Terminated, terminable
@@ -45,6 +44,7 @@ from scene_envs.errors import (
 )
 from scene_envs.files import find_scenes
 from scene_envs.registry import ALLOWED, FILES, PluginError, run_file
+from scene_envs.scene_types import list_scene_types
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -332,7 +332,7 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     if (scene := getattr(settings, "scene", None)) is not None and not isinstance(scene, str):
         raise InvalidInputError(f"scene={str(scene)[:200]}: give the name of one scene type, or several joined by +")
     for scene in str(getattr(settings, "scene", "") or "").split("+"):
-        _check_name("scene type", scene, known_scenes)
+        _check_name("scene type", scene, list_scene_types)
     for mask in [getattr(settings, "mask", None), *(getattr(settings, "masks", None) or [])]:
         _check_name("mask", mask, known_masks)
     device = getattr(settings, "device", "auto")

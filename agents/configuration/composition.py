@@ -33,7 +33,8 @@ from scene_envs.errors import (
     unknown_name,
 )
 from scene_envs.progress import STYLES
-from scene_envs.registry import load_plugins, plugin_entry_points
+from scene_envs.registry import plugin_entry_points
+from scene_envs.scene_types import list_scene_types
 
 Config = TypeVar("Config")
 Kind = TypeVar("Kind", bound=type)
@@ -345,16 +346,7 @@ def known_masks() -> list[str]:
     return sorted({*MASKS, *plugin_entry_points("scene_envs.masks")})
 
 
-def known_scenes() -> list[str]:
-    """Names of scene types; imports the modules of installed packages that register more."""
-    from scene_envs.scene_types import list_scene_types
-
-    if plugin_entry_points("scene_envs.grammars"):
-        load_plugins("scene_envs.grammars")
-    return list_scene_types()
-
-
-_REGISTERED = {"reward": known_rewards, "mask": known_masks, "scene": known_scenes}
+_REGISTERED = {"reward": known_rewards, "mask": known_masks, "scene": list_scene_types}
 
 
 def group_options(folder: str, config_dir: str = "") -> list[str]:

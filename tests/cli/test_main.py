@@ -365,8 +365,9 @@ def test_the_names_that_are_known_without_torch_are_those_of_the_packages():
     assert len(own) > 15
     assert len(list_priors()) > 8
     code = (
-        "from agents.configuration.composition import known_masks, known_rewards, known_scenes\n"
-        "print([known_masks(), known_rewards(), known_scenes()])"
+        "from agents.configuration.composition import known_masks, known_rewards\n"
+        "from scene_envs import list_scene_types\n"
+        "print([known_masks(), known_rewards(), list_scene_types()])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     masks, rewards, scenes = ast.literal_eval(done.stdout)

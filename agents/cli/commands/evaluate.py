@@ -36,27 +36,15 @@ _OF_PROMPTS = {"prompt_count", "guidance", "claim_guidance"}
 
 
 @dataclass
-class RealSceneKeys:
-    """Real scenes to compare with.
-
-    Attributes:
-        data: dataset folder on which the prior was trained; several, joined by commas, for a prior of several scene
-            types. Empty compares with fresh scenes of the grammar and leaves out novelty.
-        heldout: dataset folder of held-out scenes; empty takes the last scenes of data.
-        training_scenes: number of random scenes of data among which novelty looks for the nearest.
-    """
-
-    data: str = ""
-    heldout: str = ""
-    training_scenes: Count = 20_000
-
-
-@dataclass
-class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
+class EvaluateConfig(DrawKeys, OutputKeys):
     """Measures of a prior's raw samples, each beside that of real scenes.
 
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
+        data: dataset folder on which the prior was trained; several, joined by commas, for a prior of several scene
+            types. Empty compares with fresh scenes of the grammar and leaves out novelty.
+        heldout: dataset folder of held-out scenes; empty takes the last scenes of data.
+        training_scenes: number of random scenes of data among which novelty looks for the nearest.
         count: number of samples, and of real scenes in each of the two sets for comparison.
         prompt_count: number of samples with prompts of held-out scenes, at most count; null takes count.
         guidance: weight of classifier-free guidance for the samples with prompts, 0 for none.
@@ -72,6 +60,9 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
     """
 
     prior: str = "dimsum_table"
+    data: str = ""
+    heldout: str = ""
+    training_scenes: Count = 20_000
     count: Annotated[int, at_least(2)] = 200
     prompt_count: int | None = None
     guidance: Annotated[float, FINITE] = 0.0
