@@ -208,7 +208,8 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
                 choices.pop(key, None)
     if config_file and "recipe" in choices:
         raise InvalidInputError("recipe= and --config exclude each other: the file says everything already")
-    tree = verbatim({key: value for key, value in tree.items() if key not in choices})
+    replaced = {*choices, *(key for key in values if key in fields and fields[key].metadata.get("named"))}
+    tree = verbatim({key: value for key, value in tree.items() if key not in replaced})
     made = by_hydra(command, config, choices, config_dir)
     for key, value in values.items():
         made = _with(made, key, value, config, tree)

@@ -404,10 +404,9 @@ def _complete(kind: type, given: Mapping[str, Any], fields: Mapping[str, datacla
         choices["recipe"] = given["recipe"]
         check_option("recipe", given["recipe"], group_options("recipe"))
     tree = by_hydra(kind.__name__, kind, choices)
-    for name, value in given.items():
-        base = tree.get(name)
-        if name not in options:
-            tree[name] = merged(base, value) if isinstance(base, Mapping) and isinstance(value, Mapping) else value
+    for name in given.keys() - options:
+        is_part = dataclasses.is_dataclass(fields[name].default_factory) and isinstance(given[name], Mapping)
+        tree[name] = merged(tree.get(name, {}), given[name]) if is_part else given[name]
     return {name: _group(fields[name], value) for name, value in tree.items()}
 
 
