@@ -337,12 +337,6 @@ def test_textures_become_colours_and_photographs_few_enough_of_them():
     np.testing.assert_allclose(textured.triangles, ball.triangles)
 
 
-def test_the_page_on_exports_shows_every_target() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8")
-    for name in ("mujoco", "pydrake", "pybullet", "pxr", "numpy"):
-        assert f"import {name}" in page or f"from {name}" in page, name
-
-
 @pytest.fixture(scope="module")
 def prior(tmp_path_factory) -> str:
     """The folder of an untrained prior with 6 slots."""
