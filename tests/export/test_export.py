@@ -7,7 +7,6 @@ import json
 import re
 import sys
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
