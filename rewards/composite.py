@@ -18,12 +18,8 @@ from rewards.base import (
     Reward,
     RewardContext,
     RewardOutput,
-    averages_objects,
-    counts_objects,
     declared_maximum,
-    depends_on_batch,
     facts_of,
-    needs_prompts,
 )
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
@@ -57,10 +53,8 @@ class WeightedSum:
         if len(self.weights) != len(self.rewards):
             raise InvalidInputError(f"weighted_sum: {len(self.rewards)} rewards need as many weights, got {weights!r}")
         self.offset = float(offset)
-        self.depends_on_batch = depends_on_batch(*self.rewards)
-        self.averages_objects = averages_objects(*self.rewards)
-        self.counts_objects = counts_objects(*self.rewards)
-        self.needs_prompts = needs_prompts(*self.rewards)
+        self.facts = facts_of(*self.rewards)
+        vars(self).update(self.facts)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         outputs = _score_parts(self.rewards, batch, context)
@@ -77,7 +71,7 @@ class WeightedSum:
     def _credit(self, reward: Reward, output: RewardOutput, batch: SceneBatch) -> Tensor:
         """(B, N) credits of a part; in a sum of means and other rewards, those of a mean are shares of its value."""
         assert output.per_object is not None
-        if self.averages_objects or not averages_objects(reward):
+        if self.facts["averages_objects"] or not facts_of(reward)["averages_objects"]:
             return output.per_object
         judged = output.object_flags.get("judged", batch.is_free)
         return output.per_object / judged.sum(dim=1, keepdim=True).clamp(min=1)
@@ -101,7 +95,7 @@ class Product:
 
     def __init__(self, rewards: Sequence[Any]) -> None:
         self.rewards = _resolve_parts(self.name, rewards)
-        self.depends_on_batch = depends_on_batch(*self.rewards)
+        vars(self).update(facts_of(*self.rewards), averages_objects=False, counts_objects=False)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         outputs = _score_parts(self.rewards, batch, context)
@@ -135,9 +129,9 @@ class Gate:
 
     def __post_init__(self) -> None:
         parts = {"reward": resolve_reward(self.reward), "condition": resolve_reward(self.condition)}
-        vars(self).update(parts, **facts_of(parts["reward"]))
-        vars(self)["depends_on_batch"] = depends_on_batch(*parts.values())
-        vars(self)["needs_prompts"] = needs_prompts(*parts.values())
+        both = facts_of(*parts.values())
+        of_both = {name: both[name] for name in ("depends_on_batch", "needs_prompts")}
+        vars(self).update(parts, **facts_of(parts["reward"]) | of_both)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score both; credit per object is that of ``reward`` where the gate is open, else 0."""
@@ -217,11 +211,13 @@ def _combine(
 ) -> RewardOutput:
     terms: dict[str, Tensor] = {}
     flags: dict[str, Tensor] = {}
+    first = next(iter(outputs))
     for label, output in outputs.items():
         terms[label] = output.value
         terms.update({f"{label}.{name}": term for name, term in output.terms.items()})
         for name, flag in output.object_flags.items():
-            flags[name if name not in flags else f"{label}.{name}"] = flag
+            is_free = name not in flags and (label == first or name != "judged")  # slots with credit are the first's
+            flags[name if is_free else f"{label}.{name}"] = flag
     terms.update(own_terms or {})
     valid = torch.stack([output.is_valid for output in outputs.values()]).all(dim=0)
     return RewardOutput(value, per_object, terms, valid, flags)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -116,10 +116,9 @@ class IsolatedReward:
         body = self._ask("score", replace(batch.scene_type), scenes, facts)
 
         def tensor(array: Any) -> Any:
-            return array if array is None else torch.from_numpy(np.array(array)).to(batch.tensor.device)
+            return torch.from_numpy(np.array(array)).to(batch.tensor.device)
 
-        terms, flags = ({name: tensor(part) for name, part in body[key].items()} for key in ("terms", "object_flags"))
-        return RewardOutput(tensor(body["value"]), tensor(body["per_object"]), terms, tensor(body["valid"]), flags)
+        return RewardOutput(**_each(tensor, np.ndarray, body))
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
@@ -228,7 +227,7 @@ class RewardRunner:
         return declared_maximum(self.reward, slots, free_slots)
 
     def score(self, scene_type: Any, scenes: Any, facts: tuple[Any, int, int]) -> dict[str, Any]:
-        """Score one batch; returns the output as arrays."""
+        """Score one batch; returns the fields of the output, as arrays."""
         prompts, seed, draw = facts
         try:
             known = get_scene_type(scene_type.name)
@@ -238,13 +237,15 @@ class RewardRunner:
         context = RewardContext(prompts=prompts, pool=self.pool, seed=seed)
         with other_draw(draw):
             output = evaluate_reward(self.reward, batch, context, strict=True)
-        return {
-            "value": output.value.cpu().numpy(),
-            "per_object": None if output.per_object is None else output.per_object.cpu().numpy(),
-            "terms": {name: term.cpu().numpy() for name, term in output.terms.items()},
-            "valid": output.is_valid.cpu().numpy(),
-            "object_flags": {name: flag.cpu().numpy() for name, flag in output.object_flags.items()},
-        }
+        fields: dict[str, Any] = _each(lambda tensor: tensor.cpu().numpy(), torch.Tensor, vars(output))
+        return fields
+
+
+def _each(change: Callable[[Any], Any], kind: type, part: Any) -> Any:
+    """``part`` with ``change`` applied to what is of this ``kind``, in mappings too."""
+    if isinstance(part, Mapping):
+        return {name: _each(change, kind, value) for name, value in part.items()}
+    return change(part) if isinstance(part, kind) else part
 
 
 class SeededReward:

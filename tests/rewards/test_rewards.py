@@ -15,9 +15,10 @@ from rewards import (
     RewardOutput,
     WeightedSum,
     evaluate_reward,
+    facts_of,
     resolve_reward,
 )
-from rewards.base import averages_objects, declared_maximum
+from rewards.base import declared_maximum
 from rewards.process import run_reward
 from scene_envs import SceneBatch
 from scene_envs.errors import InvalidInputError
@@ -200,7 +201,35 @@ def test_the_largest_value_is_declared(reward, largest):
     ],
 )
 def test_means_over_objects_say_so(reward, averages):
-    assert averages_objects(resolve_reward(reward)) == averages
+    assert facts_of(resolve_reward(reward))["averages_objects"] == averages
+
+
+@pytest.mark.parametrize(
+    "reward",
+    [
+        {"name": "weighted_sum", "rewards": ["object_count", "prompt_match"]},
+        {"name": "product", "rewards": ["object_count", "prompt_match"]},
+        {"name": "gate", "reward": "object_count", "condition": "prompt_match", "threshold": 1.0},
+        {"name": "clip", "reward": "prompt_match", "high": 0.5},
+    ],
+)
+def test_a_composite_needs_prompts_when_a_part_does(reward):
+    assert facts_of(resolve_reward(reward))["needs_prompts"]
+    fixed = repr(reward).replace("'prompt_match'", "{'name': 'prompt_match', 'prompt': 'A scene with a cup.'}")
+    assert not facts_of(resolve_reward(eval(fixed)))["needs_prompts"]
+
+
+def test_slots_with_credit_are_those_of_the_gated_reward(cups):
+    """The condition judges other slots, which get no say."""
+
+    def condition(batch, context):
+        return RewardOutput(torch.ones(2), object_flags={"judged": torch.zeros(2, 6, dtype=torch.bool)})
+
+    def judges_all(batch, context):
+        return RewardOutput(torch.ones(2), object_flags={"judged": torch.ones(2, 6, dtype=torch.bool)})
+
+    assert "judged" not in score(Gate(distances, condition, threshold=0.0), cups).object_flags
+    assert bool(score(Gate(judges_all, condition, threshold=0.0), cups).object_flags["judged"].all())
 
 
 def test_a_function_declares_its_largest_value_by_an_attribute():
