@@ -15,7 +15,7 @@ from rewards.base import (
 from rewards.check import check_reward
 from rewards.clearance import Clearance
 from rewards.clutter import Clutter
-from rewards.composite import Clip, Gate, Product, WeightedSum
+from rewards.composite import Clip, Product, WeightedSum
 from rewards.counts import CategoryCount, ObjectCount
 from rewards.diversity import Diversity
 from rewards.evaluation import evaluate_reward
@@ -46,7 +46,6 @@ __all__ = [
     "Diversity",
     "FeasibleObjects",
     "FeasibleShare",
-    "Gate",
     "IsolatedReward",
     "LearnedReward",
     "ObjectCount",

@@ -141,10 +141,5 @@ def learned_parts(reward: Any) -> list[LearnedReward]:
     """
     if isinstance(reward, LearnedReward):
         return [reward]
-    return [found for part in parts_of(reward) for found in learned_parts(part)]
-
-
-def parts_of(reward: Any) -> list[Any]:
-    """The parts of a composite, in a fixed order; none of any other reward."""
-    parts = [getattr(reward, name) for name in ("reward", "condition") if hasattr(reward, name)]
-    return [*parts, *getattr(reward, "rewards", ())]
+    parts = [*([reward.reward] if hasattr(reward, "reward") else []), *getattr(reward, "rewards", ())]
+    return [found for part in parts for found in learned_parts(part)]

@@ -1,4 +1,4 @@
-"""Composite rewards: weighted sum, product, gate, clip.
+"""Composite rewards: weighted sum, product, clip.
 
 Every part may be a name, a mapping, a function or a reward. A scene is valid when every part could score it.
 A composite depends on the batch if a part does. A part's value is a term under the part's name, and its own
@@ -105,44 +105,6 @@ class Product:
         return f"Product({list(self.rewards)})"
 
 
-@register_reward("gate")
-@dataclass(frozen=True)
-class Gate:
-    """A reward that counts only where another one reaches a threshold.
-
-    Attributes:
-        reward: reward to compute.
-        condition: reward that opens the gate.
-        threshold: smallest value of ``condition`` at which the gate is open.
-        otherwise: value of scenes with a closed gate.
-
-    >>> gate = Gate("object_count", condition="object_count", threshold=2.0, otherwise=-1.0)
-    >>> gate(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
-    tensor([-1.])
-    """
-
-    name: ClassVar[str] = "gate"
-    reward: Any
-    condition: Any
-    threshold: float
-    otherwise: float = 0.0
-
-    def __post_init__(self) -> None:
-        parts = {"reward": resolve_reward(self.reward), "condition": resolve_reward(self.condition)}
-        both = facts_of(*parts.values())
-        of_both = {name: both[name] for name in ("depends_on_batch", "needs_prompts")}
-        vars(self).update(parts, **facts_of(parts["reward"]) | of_both)
-
-    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Score both; credit per object is that of ``reward`` where the gate is open, else 0."""
-        outputs = _score_parts((self.reward, self.condition), batch, context)
-        scored, condition = outputs.values()
-        is_open = condition.value >= self.threshold
-        value = torch.where(is_open, scored.value, torch.full_like(scored.value, self.otherwise))
-        credit = None if scored.per_object is None else scored.per_object * is_open.unsqueeze(-1)
-        return _combine(value, outputs, credit, {"gate_open": is_open.float()})
-
-
 @register_reward("clip")
 @dataclass(frozen=True)
 class Clip:
@@ -203,21 +165,13 @@ def _score_parts(parts: Sequence[Reward], batch: SceneBatch, context: RewardCont
     return outputs
 
 
-def _combine(
-    value: Tensor,
-    outputs: Mapping[str, RewardOutput],
-    per_object: Tensor | None = None,
-    own_terms: Mapping[str, Tensor] | None = None,
-) -> RewardOutput:
+def _combine(value: Tensor, outputs: Mapping[str, RewardOutput], per_object: Tensor | None = None) -> RewardOutput:
     terms: dict[str, Tensor] = {}
     flags: dict[str, Tensor] = {}
-    first = next(iter(outputs))
     for label, output in outputs.items():
         terms[label] = output.value
         terms.update({f"{label}.{name}": term for name, term in output.terms.items()})
         for name, flag in output.object_flags.items():
-            is_free = name not in flags and (label == first or name != "judged")  # slots with credit are the first's
-            flags[name if is_free else f"{label}.{name}"] = flag
-    terms.update(own_terms or {})
+            flags[name if name not in flags else f"{label}.{name}"] = flag
     valid = torch.stack([output.is_valid for output in outputs.values()]).all(dim=0)
     return RewardOutput(value, per_object, terms, valid, flags)

@@ -96,7 +96,6 @@ class SceneDataset:
         scene_type: str | SceneType | None = None,
         aliases: Mapping[str, str] | None = None,
         limit: int | None = None,
-        metadata: str | os.PathLike[str] | None = None,
         fixed_tolerance: float = FIXED_TOLERANCE,
         slots: int | None = None,
     ) -> SceneDataset:
@@ -112,7 +111,6 @@ class SceneDataset:
             scene_type: Scene type; None takes the one named in the metadata (datasets of others name none).
             aliases: Mapping of model paths, or their stems, to asset names, for datasets with other asset names.
             limit: Largest number of scenes to read.
-            metadata: Path of ``metadata.json``, when it is neither in the folder of the files nor in the folder above.
             fixed_tolerance: Largest distance (m, rotation entries) of fixed objects from the scene type's pose, which
                 they then get. ``math.inf`` accepts any pose.
             slots: N of the scenes, at least that of the files; None takes that of the files.
@@ -123,7 +121,7 @@ class SceneDataset:
             UnknownNameError: a model path that is no asset of the scene type.
         """
         files = find_files(path)
-        info = read_metadata(metadata or find_metadata(path))
+        info = read_metadata(find_metadata(path))
         layout = Layout(info, _known_type(info, scene_type), aliases or {}, fixed_tolerance, slots)
         parts: list[Tensor] = []
         sets: list[tuple[str, ...]] = []
@@ -136,8 +134,7 @@ class SceneDataset:
         padded = [SceneBatch(part, layout.scene_type).with_slots(width).tensor for part in parts]
         tensor = torch.cat(padded)[:limit] if parts else torch.empty(0, width, layout.scene_type.features)
         dataset = cls(tensor, sets[:limit], layout.normalizer, layout.scene_type, layout.info.metadata)
-        own = metadata is None and (Path(path) / METADATA).is_file()
-        if own and not dataset.complete and (limit is None or len(dataset) < limit):
+        if (Path(path) / METADATA).is_file() and not dataset.complete and (limit is None or len(dataset) < limit):
             _LOGGER.warning(
                 "%r holds %d of the %d requested scenes: shards are missing, or are still being generated; "
                 "run the same scene-envs generate command again to make the rest",

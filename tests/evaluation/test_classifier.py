@@ -17,7 +17,7 @@ QUICK = ClassifierConfig(epochs=8, patience=4, batch_size=16)
 
 @pytest.fixture(scope="module")
 def scenes() -> SceneBatch:
-    return grammar_scenes("dimsum_table", 240, seed=4)
+    return grammar_scenes("dimsum_table", 160, seed=4)
 
 
 def lifted(batch: SceneBatch, by: float) -> SceneBatch:
@@ -39,14 +39,13 @@ def two_cups(distance: float) -> SceneBatch:
 
 @pytest.mark.slow
 def test_real_against_real_is_chance(scenes: SceneBatch) -> None:
-    accuracy = classifier_accuracy(scenes[:120], scenes[120:], seeds=2, config=QUICK)
-    assert accuracy.mean == pytest.approx(0.5, abs=0.13)  # 84 held-out scenes a seed: 5 % standard error
-    assert len(accuracy.per_seed) == 2
+    accuracy = classifier_accuracy(scenes[:80], scenes[80:], seeds=1, config=QUICK)
+    assert accuracy.mean == pytest.approx(0.5, abs=0.27)  # 56 held-out scenes: 7 % standard error
 
 
 @pytest.mark.slow
 def test_scenes_five_millimetres_too_high_are_found_out(scenes: SceneBatch) -> None:
-    accuracy = classifier_accuracy(scenes[:120], lifted(scenes[120:], 5e-3), seeds=1, config=QUICK)
+    accuracy = classifier_accuracy(scenes[:80], lifted(scenes[80:], 5e-3), seeds=1, config=QUICK)
     assert accuracy.mean > 0.9
 
 
@@ -57,6 +56,7 @@ def test_the_same_seed_gives_the_same_accuracy_and_leaves_torch_alone(scenes: Sc
     short = ClassifierConfig(epochs=1)
     first, again = (classifier_accuracy(scenes[:40], scenes[40:80], seeds=2, config=short) for _ in range(2))
     assert first == again
+    assert len(first.per_seed) == 2
     assert torch.equal(torch.rand(3), expected)
 
 
