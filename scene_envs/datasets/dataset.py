@@ -233,7 +233,7 @@ def to_union(batch: SceneBatch, union: SceneType) -> SceneBatch:
     """
     known = {name: index for index, name in enumerate(union.assets)}
     table = torch.tensor([known.get(name, -1) for name in batch.scene_type.assets] + [union.num_assets])
-    categories = table[batch.categories]
+    categories = table.to(batch.tensor.device)[batch.categories]
     if bool((categories < 0).any()):
         scene, slot = torch.nonzero(categories < 0)[0].tolist()
         asset = batch.scene_type.assets[int(batch.categories[scene, slot])]

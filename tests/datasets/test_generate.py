@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 import torch
 
-from scene_envs.datasets import SceneDataset, StorageError, generate, generation
+from scene_envs.datasets import SceneDataset, generate, generation
 from scene_envs.datasets.generation import fixed_normalizer, generation_progress, judge_scenes
-from scene_envs.errors import CorruptFileError, InvalidInputError, PhysicsError, UnknownNameError
+from scene_envs.errors import CorruptFileError, InvalidInputError, PhysicsError, StorageError, UnknownNameError
 from scene_envs.grammars import get_grammar, register_grammar
 from scene_envs.scene import SceneBatch
+from tests.helpers.fake_gpu import fake_gpu
 from tests.helpers.forked import forked
 from tests.helpers.toy_grammars import CUPS_COUNT, TYPE, ToyGrammar, generate_cups, toy_cups
 
@@ -293,11 +294,16 @@ def test_objects_welded_at_generated_poses_are_normalised_like_any_other() -> No
     torch.testing.assert_close(normalizer.unnormalize(normalizer.normalize(scenes)), scenes)
 
 
-def test_verification_keeps_grammar_scenes_and_drops_broken_ones_with_reasons() -> None:
+def test_verification_keeps_grammar_scenes_and_drops_broken_ones_with_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
     good = get_grammar("dimsum_table").sample(np.random.default_rng(0), 6)
     tensor = good.tensor.clone()
     tensor[1, 1, 0] = 3.0  # off the table
     tensor[2, 2, :3] = tensor[2, 1, :3]  # one object inside another
     tensor[3, 1, 2] = 0.3  # in the air: it falls
-    verdicts = judge_scenes(SceneBatch(tensor, good.scene_type))
-    assert verdicts == ["", "outside workspace", "penetration", "moved while settling", "", ""]
+    batch, expected = (
+        SceneBatch(tensor, good.scene_type),
+        ["", "outside workspace", "penetration", "moved while settling"],
+    )
+    assert judge_scenes(batch) == [*expected, "", ""]
+    with fake_gpu(monkeypatch):
+        assert judge_scenes(batch[:4].to("cuda")) == expected

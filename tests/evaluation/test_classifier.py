@@ -11,6 +11,7 @@ from agents.evaluation.classifier import Accuracy, ClassifierConfig, classifier_
 from agents.evaluation.set_network import SetNetwork, SetNetworkConfig, blurred, scene_tokens
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+from tests.helpers.fake_gpu import fake_gpu
 
 QUICK = ClassifierConfig(epochs=8, patience=4, batch_size=16)
 
@@ -58,6 +59,13 @@ def test_the_same_seed_gives_the_same_accuracy_and_leaves_torch_alone(scenes: Sc
     assert first == again
     assert len(first.per_seed) == 2
     assert torch.equal(torch.rand(3), expected)
+
+
+def test_scenes_of_two_devices_are_compared(scenes: SceneBatch, monkeypatch: pytest.MonkeyPatch) -> None:
+    short = ClassifierConfig(epochs=1)
+    expected = classifier_accuracy(scenes[:24], scenes[24:48], seeds=1, config=short)
+    with fake_gpu(monkeypatch):
+        assert classifier_accuracy(scenes[:24], scenes[24:48].to("cuda"), seeds=1, config=short) == expected
 
 
 def test_accuracy_summarises_its_seeds() -> None:
