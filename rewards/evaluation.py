@@ -7,9 +7,9 @@ import linecache
 import logging
 import os
 import random
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -28,7 +28,8 @@ from scene_envs.scene import SceneBatch
 
 logger = logging.getLogger(__name__)
 
-_local = threading.local()
+DRAW: ContextVar[int] = ContextVar("draw", default=0)
+"""Number of the stream of random numbers from which rewards draw."""
 _warned: set[tuple[int, str]] = set()
 _MAX_WARNINGS = 256
 
@@ -37,14 +38,14 @@ _MAX_WARNINGS = 256
 def seeded_generators(seed: int, batch: SceneBatch | None = None) -> Iterator[None]:
     """Context in which the generators of torch (CPU), NumPy and Python have a seed that depends on the scenes.
 
-    The seed depends only on ``seed``, the scenes (None while the reward is made) and :func:`current_draw`, so the same
+    The seed depends only on ``seed``, the scenes (None while the reward is made) and :data:`DRAW`, so the same
     scenes get the same numbers in every call and process, and after a run is resumed. Earlier states come back
     afterwards.
     """
     states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     scenes = b"" if batch is None else batch.tensor.detach().cpu().contiguous().numpy().tobytes()
     digest = hashlib.blake2b(scenes, digest_size=8)
-    digest.update(f"{seed} {current_draw()}".encode())
+    digest.update(f"{seed} {DRAW.get()}".encode())
     number = int.from_bytes(digest.digest(), "little")
     torch.default_generator.manual_seed(number >> 1)
     np.random.seed(number % 2**32)  # noqa: NPY002
@@ -60,17 +61,11 @@ def seeded_generators(seed: int, batch: SceneBatch | None = None) -> Iterator[No
 @contextmanager
 def other_draw(number: int) -> Iterator[None]:
     """Context in which rewards draw from the stream ``number`` of random numbers; the default stream is 0."""
-    before = current_draw()
-    _local.draw = number
+    token = DRAW.set(number)
     try:
         yield
     finally:
-        _local.draw = before
-
-
-def current_draw() -> int:
-    """Number of the stream of random numbers of this thread's rewards."""
-    return int(getattr(_local, "draw", 0))
+        DRAW.reset(token)
 
 
 def evaluate_reward(

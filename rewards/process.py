@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from rewards.base import RewardContext, RewardOutput, declared_maximum, facts_of, learned_parts
-from rewards.evaluation import current_draw, evaluate_reward, other_draw, seeded_generators
+from rewards.evaluation import DRAW, evaluate_reward, other_draw, seeded_generators
 from rewards.registry import (
     RewardInfo,
     allow_local_rewards,
@@ -23,7 +23,6 @@ from rewards.registry import (
     is_local,
     is_own,
     local_files,
-    names_in,
     plugin_module,
     registered_module,
     resolve_reward,
@@ -112,7 +111,7 @@ class IsolatedReward:
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score in the worker; the batch may be on any device."""
         scenes = batch.tensor.detach().cpu().contiguous().numpy()
-        facts = context.prompts, self.settings.seed if context.seed == 0 else context.seed, current_draw()
+        facts = context.prompts, self.settings.seed if context.seed == 0 else context.seed, DRAW.get()
         body = self._ask("score", replace(batch.scene_type), scenes, facts)
 
         def tensor(array: Any) -> Any:
@@ -314,19 +313,14 @@ def is_foreign(reward: Any) -> bool:
     >>> is_foreign("object_count"), is_foreign({"name": "clip", "reward": "./mine.py:clutter", "high": 1.0})
     (False, True)
     """
-    if isinstance(reward, Mapping) and "_target_" in reward and not str(reward["_target_"]).startswith("rewards."):
-        return True
+    if isinstance(reward, Mapping):
+        outside = not str(reward.get("_target_", "rewards.")).startswith("rewards.")
+        return outside or any(map(is_foreign, reward.values()))
     if not isinstance(reward, str):
-        return any(is_foreign(name) for name in _parts(reward))
+        return isinstance(reward, list | tuple) and any(map(is_foreign, reward))
     if is_local(reward):
         return True
     module = registered_module(reward) or plugin_module(reward)
     if module is None or module == "__main__" or module.split(".")[0] in ("rewards", "scene_envs", "agents"):
         return False
     return plugin_module(reward) is not None  # if not: registered by a module imported in this process alone
-
-
-def _parts(reward: Any) -> list[Any]:
-    if isinstance(reward, Mapping):
-        return [*names_in([reward.get("name", "")]), *(v for k, v in reward.items() if k != "name")]
-    return list(reward) if isinstance(reward, list | tuple) else []

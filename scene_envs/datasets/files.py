@@ -372,10 +372,6 @@ def read_metadata(path: str | os.PathLike[str]) -> DatasetInfo:
     missing = [key for key in needed if not isinstance(metadata, dict) or key not in metadata]
     if missing:
         raise CorruptFileError(f"{str(file)!r} lacks the keys {missing}; a dataset's metadata needs {list(needed)}")
-    return _parse(file, metadata)
-
-
-def _parse(file: Path, metadata: dict[str, Any]) -> DatasetInfo:
     for key in ("model_paths", "welded_object_model_paths"):
         if not isinstance(metadata.get(key) or [], list):
             raise CorruptFileError(f"{str(file)!r}: {key} must be a list of paths, it is {str(metadata[key])[:100]}")

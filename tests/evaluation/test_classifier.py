@@ -133,7 +133,7 @@ def test_bad_input_is_refused(scenes: SceneBatch) -> None:
     other = SceneBatch.empty("pantry_shelf", 30)
     with pytest.raises(InvalidInputError, match="'dimsum_table' cannot be compared with scenes of 'pantry_shelf'"):
         classifier_accuracy(scenes, other)
-    with pytest.raises(InvalidInputError, match="at least 20 real scenes and samples each, got 240 and 3"):
+    with pytest.raises(InvalidInputError, match="at least 20 real scenes and samples each, got 160 and 3"):
         classifier_accuracy(scenes, scenes[:3])
     with pytest.raises(InvalidInputError, match="seeds must be at least 1"):
         classifier_accuracy(scenes, scenes, seeds=0)
