@@ -83,9 +83,12 @@ class IsolatedReward:
         InvalidInputError: ``reward`` is no valid reward, or a limit is no positive number.
         RewardError: the reward cannot be made, or not in time.
 
-    >>> with IsolatedReward("object_count", timeout=60.0) as reward:
+    >>> with IsolatedReward("object_count", timeout=60.0) as reward:  # doctest: +SKIP
     ...     reward(SceneBatch.empty("dimsum_table", 2), RewardContext()).value
     tensor([1., 1.])
+    >>> IsolatedReward(len)
+    Traceback (most recent call last):
+    scene_envs.errors.InvalidInputError: only a reward given by name or as a mapping can be isolated, got <built-in ...>
     """
 
     @takes(ProcessSettings)

@@ -109,7 +109,7 @@ def encode_shard(
 
 
 @contextmanager
-def _reading(problem: str, remedy: str = "delete the file and generate again to remake it") -> Iterator[None]:
+def _reading(problem: str, remedy: str = "delete it and generate again to remake it") -> Iterator[None]:
     """Context in which an error of arrow is a CorruptFileError that names the ``problem`` and the ``remedy``."""
     try:
         yield
