@@ -14,6 +14,7 @@ from agents.configuration.composition import (
     OptimizerSettings,
     ProgressKeys,
     RewardLimitKeys,
+    Texts,
     TrainingKeys,
     composed,
     named,
@@ -419,7 +420,7 @@ class PostTrainConfig(TrainingKeys, ProgressKeys, RewardLimitKeys):
     seed: Seed = 0
     prior: str = "dimsum_table"
     reward: Any = named("object_count", "reward")
-    prompt: str | list[str] | None = None
+    prompt: Texts = None
     num_steps: Count = 25
     algorithm: AlgorithmSettings = nested(
         DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
