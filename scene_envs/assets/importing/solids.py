@@ -80,17 +80,18 @@ def few_cornered_hull(points: Array, tolerance: float, corners: int = MAX_CORNER
     full = convex_hull(points)
     if len(full.vertices) <= corners and len(full.vertices) <= 16:
         return full, 0.0
-    cloud = full.vertices
+    cloud, rows = full.vertices, np.arange(len(full.vertices))
     chosen = np.unique(np.argmax(cloud @ _DIRECTIONS.T, axis=0))[:corners].tolist()
     if np.linalg.matrix_rank(cloud[chosen] - cloud[chosen[0]], tol=1e-9) < 3:
         return full, 0.0
     while True:
-        planes = ConvexHull(cloud[chosen]).equations
+        planes = ConvexHull(full.vertices[chosen]).equations
         outside = (cloud @ planes[:, :3].T + planes[:, 3]).max(axis=1)
         worst = int(outside.argmax())
         if outside[worst] <= tolerance or len(chosen) >= corners:
-            return convex_hull(cloud[chosen]), max(0.0, float(outside[worst]))
-        chosen.append(worst)
+            return convex_hull(full.vertices[chosen]), max(0.0, float(outside[worst]))
+        chosen.append(int(rows[worst]))
+        rows, cloud = rows[outside > -1e-9], cloud[outside > -1e-9]  # what is inside stays inside a growing hull
 
 
 def concavity(points: Array, hull: ConvexPart) -> float:
@@ -148,7 +149,7 @@ def convex_parts(
     notes: list[str] = []
     warnings: list[str] = []
     parts: list[ConvexPart] = []
-    pieces: list[Any] = list(surface.split(only_watertight=False))
+    pieces = _pieces(surface)
     thick = [piece for piece in pieces if has_volume(np.asarray(piece.vertices))]
     closed = _closed(thick)
     bodies = [body for body in closed if body.volume > 0] or thick
@@ -175,6 +176,12 @@ def convex_parts(
         parts += [hull] if cut is None else [_hull(piece, tolerance) for piece in cut]
     solid = closed or parts
     return parts, mass_properties(solid, volume(solid)), notes, warnings
+
+
+def _pieces(surface: Any) -> list[Any]:
+    """The connected pieces of a bare mesh, whose holes of three or four corners are filled."""
+    is_one = surface.is_watertight and surface.body_count == 1
+    return [surface] if is_one else list(surface.split(only_watertight=False))
 
 
 def _closed(pieces: Sequence[Any]) -> list[Any]:
@@ -358,14 +365,18 @@ def _file(path: Path, changed: int) -> tuple[trimesh.Trimesh, ...]:
     return tuple(read_mesh(path))
 
 
+def file_meshes(path: Path) -> tuple[trimesh.Trimesh, ...]:
+    """As :func:`read_mesh`, read again only when the file changes; not to be changed."""
+    return _file(path, path.stat().st_mtime_ns if path.is_file() else 0)
+
+
 @lru_cache(maxsize=32)
 def meshes_of(shape: Shape) -> list[trimesh.Trimesh]:
     """The meshes of a mesh shape in the model frame, colours kept, not to be changed; raises like :func:`read_mesh`,
     and InvalidInputError for an object that its file does not hold.
     """
     assert shape.path is not None
-    found: tuple[trimesh.Trimesh, ...] = () if shape.surface is None else (shape.surface,)
-    found = found or _file(shape.path, shape.path.stat().st_mtime_ns if shape.path.is_file() else 0)
+    found = file_meshes(shape.path) if shape.surface is None else (shape.surface,)
     meshes: list[Any] = [m.copy() for m in found if shape.part is None or shape.part[0] in m.metadata["names"]]
     if shape.part is not None and not meshes:
         known = ", ".join(sorted({repr(name) for mesh in found for name in mesh.metadata["names"]}))
@@ -444,7 +455,7 @@ def _surfaces(shape: Shape) -> list[trimesh.Trimesh]:
 def solid_of(shape: Shape) -> MassProperties:
     """The solid of a shape at 1 kg/m^3, in closed form for primitives; InvalidInputError for a mesh that is open."""
     if shape.kind == "mesh":
-        bodies = _closed([piece for mesh in _surfaces(shape) for piece in mesh.split(only_watertight=False)])
+        bodies = _closed([piece for mesh in _surfaces(shape) for piece in _pieces(mesh)])
         if not bodies and shape.is_convex:
             bodies = [convex_hull(np.concatenate([mesh.vertices for mesh in meshes_of(shape)]))]
         if not bodies:
