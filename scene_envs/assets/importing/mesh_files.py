@@ -447,7 +447,12 @@ def _prepare_gltf(content: _Content) -> None:
             "(compression and instancing are options of the exporter)"
         )
     used = {n for n in header.get("extensionsUsed", ()) if n in lost or not n.startswith(looks)}
-    used |= {what for key, what in (("animations", "animations"), ("skins", "skins")) if key in header}
+    own = {n for some in (*nodes, *primitives, *header.get("materials", ())) for n in some.get("extensions", ())}
+    used |= {n for n in own if n in lost or not n.startswith(looks)} | {"animations", "skins"} & {*header}
+    used |= {"COLOR_0 beside a material" for p in primitives if "COLOR_0" in p["attributes"] and "material" in p}
+    colors = [m.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}) for m in header.get("materials", ())]
+    used |= {f"texture by TEXCOORD_{image['texCoord']}" for image in colors if image.get("texCoord")}
+    content.notes += ["its line strips are left out"] * any(p.get("mode") in (2, 3) for p in primitives)
     used |= {"morph targets" for some in [*nodes, *meshes] if any(some.get("weights", ()))}
     content.notes += [f"its {name} is not applied" for name in sorted(used)]
     uris = [image.get("uri", "data:") for image in header.get("images", ())]
