@@ -19,6 +19,7 @@ from scene_envs.assets.base import Asset, ConvexPart, bounds_of, regular_plural
 from scene_envs.assets.importing.limits import seconds_left
 from scene_envs.assets.importing.mesh_files import (
     MESH_SUFFIXES,
+    Y_UP,
     Color,
     Model,
     Shape,
@@ -414,7 +415,7 @@ def _upright(up: Axis) -> Array:
     """(3, 3) rotation that takes the axis ``up`` to +z, about one other axis."""
     quarter = {
         "z": np.eye(3),
-        "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+        "y": Y_UP,
         "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
         "-z": np.diag([1.0, -1.0, -1.0]),
     }

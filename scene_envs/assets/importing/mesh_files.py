@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
-from scene_envs.assets.importing.limits import check_file, check_triangles, seconds_left
+from scene_envs.assets.importing.limits import check_file, check_triangles, gltf_header, seconds_left
 from scene_envs.assets.shapes import MassProperties
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, SceneEnvsError
 
@@ -423,8 +423,7 @@ def _prepare_gltf(content: _Content) -> None:
     """Scales of quantised positions, and what is not loaded; refuses by its name what trimesh does not read."""
     content.axes = Y_UP
     looks, lost = (tuple(names.split()) for names in FORMATS["glTF"].values())
-    size = int.from_bytes(content.data[12:16], "little")
-    header = json.loads(content.data[20 : 20 + size] if content.type == "glb" else content.data)
+    header = gltf_header(content.data, content.type == "glb")
     accessors, nodes, meshes = header.get("accessors", []), header.get("nodes", []), header.get("meshes", [])
     primitives = [primitive for mesh in meshes for primitive in mesh["primitives"]]
     lacking = [name for name in header.get("extensionsRequired", ()) if not name.startswith(looks)]

@@ -29,7 +29,16 @@ from scene_envs.assets.importing.mesh_files import (
     painted,
     read_mesh,
 )
-from scene_envs.assets.shapes import MassProperties, Profile, box, convex_hull, mass_properties, solid, volume
+from scene_envs.assets.shapes import (
+    MassProperties,
+    Profile,
+    box,
+    convex_hull,
+    mass_properties,
+    solid,
+    volume,
+    winding_number,
+)
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.files import cache_folder, replacing
 from scene_envs.workers import WorkerFailure, run_apart
@@ -209,13 +218,9 @@ def _closed(pieces: Sequence[Any]) -> list[Any]:
 
 
 def _holds(outer: trimesh.Trimesh, inner: trimesh.Trimesh) -> bool:
-    """Whether a closed body encloses four corners of another, by their solid angles (van Oosterom and Strackee)."""
+    """Whether a closed body encloses four corners of another."""
     points = np.asarray(inner.vertices)[:: max(1, len(inner.vertices) // 4)][:4]
-    a, b, c = np.moveaxis(np.asarray(outer.triangles)[None] - points[:, None, None], 2, 0)  # each (P, F, 3)
-    la, lb, lc = (np.linalg.norm(corner, axis=-1) for corner in (a, b, c))
-    dots = (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-    turns = np.arctan2((a * np.cross(b, c)).sum(-1), la * lb * lc + dots).sum(axis=1) / (2 * np.pi)
-    return bool((np.abs(turns) > 0.5).all())
+    return all(abs(winding_number(np.asarray(outer.triangles), point)) > 0.5 for point in points)
 
 
 def _hull(points: Array, tolerance: float) -> ConvexPart:
