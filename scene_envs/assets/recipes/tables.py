@@ -40,7 +40,7 @@ def _tube(path: Any, samples: int, radii: Any, color: Any) -> trimesh.Trimesh:
 
 def _painted(size: Any, color: Any, art: Any = None, **rest: Any) -> trimesh.Trimesh:
     """A painted box; ``sides`` are the four faces around it."""
-    colors = {face: color.get(face, color.get("sides")) for face in FACES} if isinstance(color, dict) else color
+    colors: Any = {face: color.get(face, color.get("sides")) for face in FACES} if isinstance(color, dict) else color
     drawn = {face: art.get(face, art.get("sides", ()) if face in FACES[:4] else ()) for face in FACES} if art else {}
     patches: Any = {
         face: [patch for row in rows for patch in (lettering(*row[1:]) if row[0] == "lettering" else [Patch(*row)])]
