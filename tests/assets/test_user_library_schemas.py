@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -101,6 +102,13 @@ def test_each_entry_of_the_schema_of_collada(tmp_path: Path) -> None:
     reasons = set(" ".join(LEFT_OUT.values()).split())
     found = silent(tmp_path / "it.dae", changed)
     assert sorted(name for name in found if name.partition("/")[2] not in reasons) == [], found
+
+
+@pytest.mark.parametrize(("kind", "name"), [("spline", "splines"), ("convex_mesh", "convex meshes")])
+def test_a_geometry_without_triangles_is_refused_by_its_kind(tmp_path: Path, kind: str, name: str) -> None:
+    text = re.sub("<mesh>.*</mesh>", f"<{kind}/>", dae(triangles(block()), block().vertices), flags=re.DOTALL)
+    (tmp_path / "it.dae").write_text(text)
+    assert f"its {name} are left out" in outcome(tmp_path / "it.dae")
 
 
 # -- glTF -----------------------------------------------------------------------------------------

@@ -158,7 +158,7 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
             "`pip install 'scene-envs[collada]'`"
         ) from error
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = "; ".join([" ".join(str(error).split()) or type(error).__name__, *dict.fromkeys(content.notes)])
         raise CorruptFileError(f"{path} cannot be read as a {suffix[1:].upper()} mesh: {reason}") from error
     if len(pieces) < len(found):
         content.notes.append(f"{len(found) - len(pieces)} object(s) of points or lines left out")
