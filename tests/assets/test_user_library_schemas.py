@@ -15,7 +15,7 @@ import pytest
 
 from scene_envs.assets.importing.build import AssetEntry, build_asset
 from scene_envs.errors import SceneEnvsError
-from tests.assets.test_user_library_references import POINTS, block, dae, gltf, triangles
+from tests.helpers.model_files import POINTS, block, dae, gltf, triangles
 
 CUBE = "box 0.2 0.1 0.04"
 
