@@ -286,7 +286,7 @@ def test_the_grammar_gives_two_different_sets() -> None:
 
 
 def test_a_list_that_holds_all_is_all() -> None:
-    assert choose_measures("all,layout") == choose_measures(["layout", "all"]) == choose_measures("all")
+    assert choose_measures(["layout", "all"]) == choose_measures("all")
 
 
 @pytest.mark.slow
