@@ -149,6 +149,18 @@ def mass_properties(parts: Iterable[ConvexPart], mass: float) -> MassProperties:
     return MassProperties(mass, center, 0.5 * (inertia + inertia.T))
 
 
+def winding_number(triangles: Array, point: Array) -> float:
+    """How often triangles (F, 3, 3) enclose a point (3,): 1 in a closed surface, -1 in one turned inside out, 0 out of
+    both, and a fraction near an open one (Van Oosterom and Strackee, 1983).
+    """
+    a, b, c = (triangles - point).swapaxes(0, 1)
+    ab, bc, ca = (np.einsum("fk,fk->f", *pair) for pair in ((a, b), (b, c), (c, a)))
+    a_length, b_length, c_length = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+    volume = np.einsum("fk,fk->f", a, np.cross(b, c))
+    rest = a_length * b_length * c_length + ab * c_length + bc * a_length + ca * b_length
+    return float(np.arctan2(volume, rest).sum() / (2.0 * np.pi))
+
+
 def surface(vertices: ArrayLike, faces: ArrayLike, color: Color, normals: ArrayLike | None = None) -> trimesh.Trimesh:
     """One mesh of one colour; normals (V, 3) default to those of the faces around a vertex."""
     vertices = np.asarray(vertices, dtype=np.float64)

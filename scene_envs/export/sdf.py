@@ -9,7 +9,7 @@ import numpy as np
 
 from scene_envs.arrays import Array
 from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, number, numbers
-from scene_envs.export.urdf import DRAKE, drake_contact, relative, write_xml
+from scene_envs.export.urdf import DRAKE, drake_contact, inertia_entries, relative, write_xml
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
@@ -40,9 +40,8 @@ def _add_model(world: ET.Element, item: PlacedObject, files: AssetFiles, folder:
         _text(inertial, "pose", f"{numbers(asset.center_of_mass)} 0 0 0")
         _text(inertial, "mass", number(item.mass))
         inertia = ET.SubElement(inertial, "inertia")
-        for i, a in enumerate("xyz"):
-            for j in range(i, 3):
-                _text(inertia, f"i{a}{'xyz'[j]}", number(item.inertia[i, j]))
+        for tag, text in inertia_entries(item).items():
+            _text(inertia, tag, text)
     visual = ET.SubElement(link, "visual", name="visual")
     _add_mesh(visual, files.visual(asset), folder)
     for part in files.parts(asset):

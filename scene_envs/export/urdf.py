@@ -59,6 +59,11 @@ def drake_contact(asset: Asset, friction: float) -> dict[str, float | None]:
     return {**shape, "mu_static": friction, "mu_dynamic": friction}
 
 
+def inertia_entries(item: PlacedObject) -> dict[str, str]:
+    """The six entries ``ixx`` … of the inertia (kg m^2) as text."""
+    return {f"i{'xyz'[i]}{'xyz'[j]}": number(item.inertia[i, j]) for i in range(3) for j in range(i, 3)}
+
+
 def relative(path: Path, folder: Path) -> str:
     """``path`` as seen from ``folder``, with forward slashes."""
     return Path(os.path.relpath(path, folder)).as_posix()
@@ -80,10 +85,7 @@ def _write(item: PlacedObject, files: AssetFiles, parts: list[Path], path: Path)
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "origin", xyz=numbers(asset.center_of_mass), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=number(item.mass))
-    moments = {
-        f"i{a}{b}": number(item.inertia[i, j]) for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j
-    }
-    ET.SubElement(inertial, "inertia", moments)
+    ET.SubElement(inertial, "inertia", inertia_entries(item))
     visual = ET.SubElement(ET.SubElement(link, "visual"), "geometry")
     ET.SubElement(visual, "mesh", filename=relative(files.visual(asset), path.parent))
     for part in parts:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from scene_envs.arrays import Array, Index
 from scene_envs.assets import Asset, get_library
+from scene_envs.assets.shapes import winding_number
 from scene_envs.errors import InvalidInputError
 from scene_envs.render.raster import Pinhole, visible_triangles
 from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type
@@ -158,18 +159,6 @@ class _Model:
 
 get_stage = cache(Stage)
 """The stage of this process for asset names in category order, which are looked up in the given folders first."""
-
-
-def winding_number(triangles: Array, point: Array) -> float:
-    """How often triangles (F, 3, 3) enclose a point (3,): 1 in a closed surface, -1 in one turned inside out, 0 out of
-    both, and a fraction near an open one (Van Oosterom and Strackee, 1983).
-    """
-    a, b, c = (triangles - point).swapaxes(0, 1)
-    ab, bc, ca = (np.einsum("fk,fk->f", *pair) for pair in ((a, b), (b, c), (c, a)))
-    a_length, b_length, c_length = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
-    volume = np.einsum("fk,fk->f", a, np.cross(b, c))
-    rest = a_length * b_length * c_length + ab * c_length + bc * a_length + ca * b_length
-    return float(np.arctan2(volume, rest).sum() / (2.0 * np.pi))
 
 
 def vertex_colors(asset: Asset) -> NDArray[np.uint8]:

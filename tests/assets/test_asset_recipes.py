@@ -14,12 +14,13 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.assets import get_library, list_assets
 from scene_envs.assets.base import indefinite_article
-from scene_envs.assets.recipes.furniture import TIERS
 from scene_envs.physics import equilibrium, feasibility, penetration, project, settle
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, FixedObject, SceneType
 
+TIERS = (-0.3915, -0.1232, 0.1392, 0.4075)
+"""Heights of the upper surfaces of the boards in the frame of the shelf, m."""
 FOOD = {  # (x, y, z) m, handles aside
     "cereal_box": (0.19, 0.06, 0.28),
     "bread_slice": (0.104, 0.10, 0.016),

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from scene_envs import scene_types
+from scene_envs.assets.shapes import winding_number
 from scene_envs.datasets import to_union
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar
@@ -20,7 +21,6 @@ from scene_envs.render.stage import (
     light_camera,
     scene_type_of_one,
     soft_shadow,
-    winding_number,
 )
 from scene_envs.scene_types import Camera, FixedObject, SceneType, get_scene_type, union_scene_type
 

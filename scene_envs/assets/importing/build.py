@@ -8,6 +8,7 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
@@ -18,6 +19,7 @@ from scene_envs.assets.base import Asset, ConvexPart, bounds_of, regular_plural
 from scene_envs.assets.importing.limits import seconds_left
 from scene_envs.assets.importing.mesh_files import (
     MESH_SUFFIXES,
+    Y_UP,
     Color,
     Model,
     Shape,
@@ -31,6 +33,7 @@ from scene_envs.assets.importing.solids import (
     PartAudit,
     collision_of,
     enclosing_hull,
+    file_meshes,
     meshes_of,
     thickness,
     visual_of,
@@ -383,8 +386,8 @@ def _read(path: Path) -> Model:
     readers = {".urdf": read_urdf, ".sdf": read_sdf, ".xml": read_mjcf}
     if reader := read_usd if suffix.startswith(".usd") else readers.get(suffix):
         return reader(path)
-    shape = Shape("mesh", (1.0, 1.0, 1.0), np.eye(4), "the mesh", path)
-    shape = dataclasses.replace(shape, pose=pose_of(np.zeros(3), meshes_of(shape)[0].metadata["upright"]))
+    pose = pose_of(np.zeros(3), file_meshes(path)[0].metadata["upright"])
+    shape = Shape("mesh", (1.0, 1.0, 1.0), pose, "the mesh", path)
     return Model(visuals=(shape,), collisions=(shape,))
 
 
@@ -392,6 +395,7 @@ def _scaled(model: Model, entry: AssetEntry) -> Model:
     """The model scaled, with its up axis turned to +z; the density is kept, so the mass grows with the scale cubed."""
     turn, scale = _upright(entry.up), entry.scale
 
+    @cache  # a mesh that is drawn and collides is read once
     def shape(old: Shape) -> Shape:
         pose = pose_of(scale * turn @ old.pose[:3, 3], turn @ old.pose[:3, :3])
         return dataclasses.replace(old, pose=pose, size=tuple(scale * s for s in old.size))
@@ -411,7 +415,7 @@ def _upright(up: Axis) -> Array:
     """(3, 3) rotation that takes the axis ``up`` to +z, about one other axis."""
     quarter = {
         "z": np.eye(3),
-        "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+        "y": Y_UP,
         "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
         "-z": np.diag([1.0, -1.0, -1.0]),
     }

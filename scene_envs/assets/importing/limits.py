@@ -15,7 +15,7 @@ from contextvars import ContextVar, copy_context
 from dataclasses import dataclass, fields
 from pathlib import Path
 from threading import Thread
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from scene_envs.errors import InvalidInputError
 
@@ -172,15 +172,17 @@ def _stated_triangles(path: Path, size: int) -> int:
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD)
-            if suffix == ".obj":
-                return _count(path, b"\nf ")
-            if suffix in (".glb", ".gltf"):
-                return _gltf_count(path, head)
-    except OSError:
-        return 0
+        if suffix in (".glb", ".gltf"):
+            accessors = gltf_header(path.read_bytes(), suffix == ".glb")["accessors"]
+            return max((int(accessor["count"]) for accessor in accessors), default=0) // 3
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return 0  # the reader of the file raises the error
+    if suffix == ".obj":
+        return path.read_bytes().count(b"\nf ")
     if suffix == ".stl":
         stated = struct.unpack("<I", head[80:84])[0] if len(head) >= 84 else 0
-        return stated if size >= 84 + 50 * stated or not head.startswith(b"solid") else _count(path, b"facet normal")
+        is_text = size < 84 + 50 * stated and head.startswith(b"solid")
+        return path.read_bytes().count(b"facet normal") if is_text else stated
     if suffix == ".ply":
         counts = re.findall(rb"^element\s+\w+\s+(\d{1,30})", head.partition(b"end_header")[0], re.MULTILINE)
         return max(map(int, counts), default=0)
@@ -190,26 +192,6 @@ def _stated_triangles(path: Path, size: int) -> int:
     return 0
 
 
-def _count(path: Path, what: bytes) -> int:
-    with path.open("rb") as file:
-        found, tail = 0, b""
-        while block := file.read(1 << 24):
-            found += (tail + block).count(what)
-            tail = block[-len(what) + 1 :]
-    return found
-
-
-def _gltf_count(path: Path, head: bytes) -> int:
-    """The largest accessor count of a glTF file, divided by 3; 0 where it cannot be read."""
-    if path.suffix.lower() == ".glb":
-        length = struct.unpack("<I", head[12:16])[0] if len(head) >= 16 else 0
-        with path.open("rb") as file:
-            file.seek(20)
-            text = file.read(length)
-    else:
-        text = path.read_bytes()
-    try:
-        accessors = json.loads(text)["accessors"]
-        return max((int(accessor["count"]) for accessor in accessors), default=0) // 3
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return 0  # the reader of the file raises the error
+def gltf_header(data: bytes, is_binary: bool) -> Any:
+    """The JSON of a glTF file, or of a GLB; ValueError for none."""
+    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")] if is_binary else data)

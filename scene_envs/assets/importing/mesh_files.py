@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
-from scene_envs.assets.importing.limits import check_file, check_triangles, seconds_left
+from scene_envs.assets.importing.limits import check_file, check_triangles, gltf_header, seconds_left
 from scene_envs.assets.shapes import MassProperties
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, SceneEnvsError
 
@@ -158,7 +158,7 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
             "`pip install 'scene-envs[collada]'`"
         ) from error
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = "; ".join([" ".join(str(error).split()) or type(error).__name__, *dict.fromkeys(content.notes)])
         raise CorruptFileError(f"{path} cannot be read as a {suffix[1:].upper()} mesh: {reason}") from error
     if len(pieces) < len(found):
         content.notes.append(f"{len(found) - len(pieces)} object(s) of points or lines left out")
@@ -423,8 +423,7 @@ def _prepare_gltf(content: _Content) -> None:
     """Scales of quantised positions, and what is not loaded; refuses by its name what trimesh does not read."""
     content.axes = Y_UP
     looks, lost = (tuple(names.split()) for names in FORMATS["glTF"].values())
-    size = int.from_bytes(content.data[12:16], "little")
-    header = json.loads(content.data[20 : 20 + size] if content.type == "glb" else content.data)
+    header = gltf_header(content.data, content.type == "glb")
     accessors, nodes, meshes = header.get("accessors", []), header.get("nodes", []), header.get("meshes", [])
     primitives = [primitive for mesh in meshes for primitive in mesh["primitives"]]
     lacking = [name for name in header.get("extensionsRequired", ()) if not name.startswith(looks)]
@@ -447,7 +446,12 @@ def _prepare_gltf(content: _Content) -> None:
             "(compression and instancing are options of the exporter)"
         )
     used = {n for n in header.get("extensionsUsed", ()) if n in lost or not n.startswith(looks)}
-    used |= {what for key, what in (("animations", "animations"), ("skins", "skins")) if key in header}
+    own = {n for some in (*nodes, *primitives, *header.get("materials", ())) for n in some.get("extensions", ())}
+    used |= {n for n in own if n in lost or not n.startswith(looks)} | {"animations", "skins"} & {*header}
+    used |= {"COLOR_0 beside a material" for p in primitives if "COLOR_0" in p["attributes"] and "material" in p}
+    colors = [m.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}) for m in header.get("materials", ())]
+    used |= {f"texture by TEXCOORD_{image['texCoord']}" for image in colors if image.get("texCoord")}
+    content.notes += ["its line strips are left out"] * any(p.get("mode") in (2, 3) for p in primitives)
     used |= {"morph targets" for some in [*nodes, *meshes] if any(some.get("weights", ()))}
     content.notes += [f"its {name} is not applied" for name in sorted(used)]
     uris = [image.get("uri", "data:") for image in header.get("images", ())]

@@ -40,8 +40,11 @@ from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDepend
 _Colors = Mapping[str, Color | None]
 _ZERO = (0.0, 0.0, 0.0)
 _TO_WORLD = "a joint holds it at `world`"
-_LEFT_OUT = ["nu actuators", "nsensor sensors", "ntendon tendons", "neq constraints", "nflex flexes", "nskin skins"]
+_LEFT_OUT = ("nu actuators", "nsensor sensors", "ntendon tendons", "neq constraints", "nflex flexes", "nskin skins",
+             "nplugin plugins", "ngravcomp gravcomp")  # fmt: skip
 """The sizes of a model in MuJoCo that count what an asset does not have."""
+_NOT_OF_USD = ("kinematicEnabled", "velocity", "angularVelocity", "restitution")
+"""Properties of UsdPhysics that an asset does not have."""
 
 
 def _unread(root: Element, kind: str) -> list[str]:
@@ -469,15 +472,18 @@ def read_usd(path: Path) -> Model:
         raise InvalidInputError(f"{path} does not state `metersPerUnit`; set it, 1 for metres or 0.01 for centimetres")
     reading = _Stage(path, stage)
     prims = [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()) if prim.IsActive()]
-    bodies = [prim for prim in prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
+    bodies = [prim for prim in prims if UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get()]
     joints = [UsdPhysics.Joint(prim) for prim in prims if prim.IsA(UsdPhysics.Joint)]
     if len(bodies) > 1 and not joints:
         names = ", ".join(str(prim.GetPath()) for prim in bodies)
         raise InvalidInputError(f"{path} holds {len(bodies)} bodies ({names}); an asset is one, so put each in a file")
     if many := [prim.GetPath() for prim in prims if prim.IsA(UsdGeom.PointInstancer)]:
         raise InvalidInputError(f"{path}: {many[0]} is a point instancer, which is not read; make its instances prims")
-    for prim in (prim for prim in prims if prim.IsA(UsdGeom.Gprim)):
-        reading.add(prim)
+    for prim in prims:
+        values = [(name, prim.GetAttribute(f"physics:{name}")) for name in _NOT_OF_USD]
+        reading.notes += [f"not read: {n} of {prim.GetPath()}" for n, value in values if value and np.any(value.Get())]
+        if prim.IsA(UsdGeom.Gprim):
+            reading.add(prim)
     for body in bodies:
         reading.weigh(body)
     notes = list(dict.fromkeys(reading.notes))

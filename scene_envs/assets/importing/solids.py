@@ -29,7 +29,16 @@ from scene_envs.assets.importing.mesh_files import (
     painted,
     read_mesh,
 )
-from scene_envs.assets.shapes import MassProperties, Profile, box, convex_hull, mass_properties, solid, volume
+from scene_envs.assets.shapes import (
+    MassProperties,
+    Profile,
+    box,
+    convex_hull,
+    mass_properties,
+    solid,
+    volume,
+    winding_number,
+)
 from scene_envs.errors import InvalidInputError, MissingDependencyError
 from scene_envs.files import cache_folder, replacing
 from scene_envs.workers import WorkerFailure, run_apart
@@ -80,17 +89,18 @@ def few_cornered_hull(points: Array, tolerance: float, corners: int = MAX_CORNER
     full = convex_hull(points)
     if len(full.vertices) <= corners and len(full.vertices) <= 16:
         return full, 0.0
-    cloud = full.vertices
+    cloud, rows = full.vertices, np.arange(len(full.vertices))
     chosen = np.unique(np.argmax(cloud @ _DIRECTIONS.T, axis=0))[:corners].tolist()
     if np.linalg.matrix_rank(cloud[chosen] - cloud[chosen[0]], tol=1e-9) < 3:
         return full, 0.0
     while True:
-        planes = ConvexHull(cloud[chosen]).equations
+        planes = ConvexHull(full.vertices[chosen]).equations
         outside = (cloud @ planes[:, :3].T + planes[:, 3]).max(axis=1)
         worst = int(outside.argmax())
         if outside[worst] <= tolerance or len(chosen) >= corners:
-            return convex_hull(cloud[chosen]), max(0.0, float(outside[worst]))
-        chosen.append(worst)
+            return convex_hull(full.vertices[chosen]), max(0.0, float(outside[worst]))
+        chosen.append(int(rows[worst]))
+        rows, cloud = rows[outside > -1e-9], cloud[outside > -1e-9]  # what is inside stays inside a growing hull
 
 
 def concavity(points: Array, hull: ConvexPart) -> float:
@@ -148,7 +158,7 @@ def convex_parts(
     notes: list[str] = []
     warnings: list[str] = []
     parts: list[ConvexPart] = []
-    pieces: list[Any] = list(surface.split(only_watertight=False))
+    pieces = _pieces(surface)
     thick = [piece for piece in pieces if has_volume(np.asarray(piece.vertices))]
     closed = _closed(thick)
     bodies = [body for body in closed if body.volume > 0] or thick
@@ -177,6 +187,12 @@ def convex_parts(
     return parts, mass_properties(solid, volume(solid)), notes, warnings
 
 
+def _pieces(surface: Any) -> list[Any]:
+    """The connected pieces of a bare mesh, whose holes of three or four corners are filled."""
+    is_one = surface.is_watertight and surface.body_count == 1
+    return [surface] if is_one else list(surface.split(only_watertight=False))
+
+
 def _closed(pieces: Sequence[Any]) -> list[Any]:
     """The bodies of a closed surface, the outermost ones facing outward, whatever way the file turns them, and what is
     inside them turned with them, so that cavities face inward; none where a piece is open or covers more than its hull.
@@ -202,13 +218,9 @@ def _closed(pieces: Sequence[Any]) -> list[Any]:
 
 
 def _holds(outer: trimesh.Trimesh, inner: trimesh.Trimesh) -> bool:
-    """Whether a closed body encloses four corners of another, by their solid angles (van Oosterom and Strackee)."""
+    """Whether a closed body encloses four corners of another."""
     points = np.asarray(inner.vertices)[:: max(1, len(inner.vertices) // 4)][:4]
-    a, b, c = np.moveaxis(np.asarray(outer.triangles)[None] - points[:, None, None], 2, 0)  # each (P, F, 3)
-    la, lb, lc = (np.linalg.norm(corner, axis=-1) for corner in (a, b, c))
-    dots = (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-    turns = np.arctan2((a * np.cross(b, c)).sum(-1), la * lb * lc + dots).sum(axis=1) / (2 * np.pi)
-    return bool((np.abs(turns) > 0.5).all())
+    return all(abs(winding_number(np.asarray(outer.triangles), point)) > 0.5 for point in points)
 
 
 def _hull(points: Array, tolerance: float) -> ConvexPart:
@@ -358,14 +370,18 @@ def _file(path: Path, changed: int) -> tuple[trimesh.Trimesh, ...]:
     return tuple(read_mesh(path))
 
 
+def file_meshes(path: Path) -> tuple[trimesh.Trimesh, ...]:
+    """As :func:`read_mesh`, read again only when the file changes; not to be changed."""
+    return _file(path, path.stat().st_mtime_ns if path.is_file() else 0)
+
+
 @lru_cache(maxsize=32)
 def meshes_of(shape: Shape) -> list[trimesh.Trimesh]:
     """The meshes of a mesh shape in the model frame, colours kept, not to be changed; raises like :func:`read_mesh`,
     and InvalidInputError for an object that its file does not hold.
     """
     assert shape.path is not None
-    found: tuple[trimesh.Trimesh, ...] = () if shape.surface is None else (shape.surface,)
-    found = found or _file(shape.path, shape.path.stat().st_mtime_ns if shape.path.is_file() else 0)
+    found = file_meshes(shape.path) if shape.surface is None else (shape.surface,)
     meshes: list[Any] = [m.copy() for m in found if shape.part is None or shape.part[0] in m.metadata["names"]]
     if shape.part is not None and not meshes:
         known = ", ".join(sorted({repr(name) for mesh in found for name in mesh.metadata["names"]}))
@@ -444,7 +460,7 @@ def _surfaces(shape: Shape) -> list[trimesh.Trimesh]:
 def solid_of(shape: Shape) -> MassProperties:
     """The solid of a shape at 1 kg/m^3, in closed form for primitives; InvalidInputError for a mesh that is open."""
     if shape.kind == "mesh":
-        bodies = _closed([piece for mesh in _surfaces(shape) for piece in mesh.split(only_watertight=False)])
+        bodies = _closed([piece for mesh in _surfaces(shape) for piece in _pieces(mesh)])
         if not bodies and shape.is_convex:
             bodies = [convex_hull(np.concatenate([mesh.vertices for mesh in meshes_of(shape)]))]
         if not bodies:

@@ -1,4 +1,4 @@
-"""Furniture: tables, which are welded, chairs and the floor."""
+"""Furniture and toys whose parts repeat by a rule: a table of boards, the floor, a speaker, rings and a toy train."""
 
 from __future__ import annotations
 
@@ -11,60 +11,33 @@ from scene_envs.assets.base import Model, asset_recipe
 from scene_envs.assets.shapes import (
     Color,
     Patch,
+    Profile,
     box,
     convex_hull,
     hull_of,
     join,
     lathe,
-    lettering,
     loft,
     moved,
     painted_box,
-    planks,
     solid,
 )
-
-_TOP_RADIUS, _TOP_THICKNESS, _HEIGHT = 0.625, 0.03, 0.785
-_WALNUT = [(142, 99, 68), (131, 90, 61), (149, 106, 74), (125, 85, 57), (137, 95, 65)]
-_EDGE, _IRON = (112, 75, 50), (62, 60, 62)
 
 _LEG = 0.70
 _ASH: list[Color] = [(218, 190, 150), (210, 180, 138), (224, 197, 158), (205, 175, 132)]
 _ASH_EDGE: Color = (190, 158, 116)
-_CHAIR: Color = (150, 102, 66)
-_CHAIR_DARK: Color = (130, 86, 54)
-_CUSHION: Color = (176, 128, 88)
 _TILES: list[Color] = [(216, 210, 200), (206, 199, 188), (220, 215, 206), (201, 194, 182)]
-# the shelf
-TIERS = (-0.3915, -0.1232, 0.1392, 0.4075)
-"""Heights of the upper surfaces of the boards in the frame of the shelf, m."""
-BOARD = 0.016
-"""Thickness of boards and sides, m."""
-BACK = 0.005
-"""Thickness of the back, m."""
-_DEPTH, _WIDTH = 0.30, 0.60
-
-
-@asset_recipe("cafe_table", display_name="table", mass=0.0, color=(139, 98, 66))
-def cafe_table() -> Model:
-    """A round table on a post; its top surface is z = 0."""
-    top = solid([(_TOP_RADIUS, -_TOP_THICKNESS), (_TOP_RADIUS, 0.0)], 32)
-    post = solid([(0.04, 0.03 - _HEIGHT), (0.04, -_TOP_THICKNESS)], 12)
-    foot = solid([(0.27, -_HEIGHT), (0.27, 0.015 - _HEIGHT), (0.05, 0.03 - _HEIGHT)], 24)
-    bevel = _TOP_RADIUS - 0.004
-    visual = join(
-        planks(_TOP_RADIUS - 0.02, 0.0, _WALNUT, count=9, rows=10, columns=3),
-        lathe([(bevel, -0.0005), (_TOP_RADIUS - 0.05, -0.0005)], _EDGE, segments=72),
-        lathe(
-            [*((r, -0.03) for r in np.linspace(0.04, _TOP_RADIUS, 10)), (_TOP_RADIUS, -0.004), (bevel, 0.0)],
-            _EDGE,
-            segments=72,
-        ),
-        lathe([(0.04, 0.03 - _HEIGHT), (0.04, -0.03)], _IRON, segments=24),
-        lathe([(0.0, -_HEIGHT), (0.27, -_HEIGHT), (0.27, 0.015 - _HEIGHT), (0.04, 0.03 - _HEIGHT)], _IRON),
-    )
-    parts = [top, post, foot]
-    return Model(visual, parts, parts)
+_RINGS: list[tuple[float, Color]] = [
+    (0.0390, (222, 62, 58)),
+    (0.0350, (244, 146, 44)),
+    (0.0310, (248, 212, 66)),
+    (0.0270, (86, 178, 92)),
+    (0.0230, (62, 128, 206)),
+]
+"""(radius m, colour), from below."""
+_BASE, _RING, _HEIGHT = 0.012, 0.019, 0.13
+_TO_X = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+"""Turns the z axis to +x."""
 
 
 @asset_recipe("breakfast_table", display_name="table", mass=0.0, color=(186, 150, 112))
@@ -86,27 +59,6 @@ def breakfast_table() -> Model:
     return Model(visual, parts, parts)
 
 
-@asset_recipe("chair", display_name="chair", mass=6.0, color=(84, 52, 32))
-def chair() -> Model:
-    """A wooden chair; a person on it looks toward +x. The seat is 0.45 m, the back 0.90 m high."""
-    seat_low, seat, height, leg = 0.415, 0.45, 0.90, 0.04
-    side, near = 0.45, 0.5 * (0.45 - 0.04)
-    board = box((side, side, seat - seat_low), (0.0, 0.0, seat_low))
-    back = box((0.03, side, height - seat), (-0.21, 0.0, seat))
-    places = [(x, y) for x in (-near, near) for y in (-near, near)]
-    legs = [box((leg, leg, seat_low), (x, y, 0.0)) for x, y in places]
-    rails = [(0.09, 0.81), (0.055, 0.70), (0.055, 0.59)]
-    visual = join(
-        painted_box((side, side, seat - seat_low), _CHAIR, {"top": [Patch(0.06, 0.05, 0.94, 0.95, _CUSHION)]},
-                    base=(0.0, 0.0, seat_low), front="+x"),
-        *(painted_box((leg, leg, seat_low), _CHAIR_DARK, base=(x, y, 0.0)) for x, y in places),
-        *(painted_box((0.03, 0.04, height - seat), _CHAIR, base=(-0.21, y, seat)) for y in (-near, near)),
-        *(painted_box((0.018, side - 0.08, tall), _CHAIR_DARK, base=(-0.21, 0.0, z)) for tall, z in rails),
-    )  # fmt: skip
-    parts = [board, back, *legs]
-    return Model(visual, parts, parts)
-
-
 @asset_recipe("floor", display_name="floor", mass=0.0, color=(206, 200, 190))
 def floor() -> Model:
     """A tiled floor, 10 m square and 0.1 m thick; its upper surface is z = 0."""
@@ -120,94 +72,6 @@ def floor() -> Model:
     ]
     part = box(size, (0.0, 0.0, -size[2]))
     return Model(painted_box(size, _TILES[1], {"top": tiles}, base=(0.0, 0.0, -size[2])), [part], [part])
-
-
-@asset_recipe("shelf", display_name="shelf", plural="shelves", mass=0.0, color=(160, 128, 72))
-def shelf() -> Model:
-    """Four boards between two sides; the origin is in the middle, the open side faces +x. The top board, 0.30 by 0.60
-    m, is open on all sides. Below it there are 0.295 m (x from -0.145 to 0.15) by 0.568 m (y) of clear space, 0.2523,
-    0.2464 and 0.2523 m high from the lowest tier up.
-    """
-    bottom, top = TIERS[0] - BOARD, TIERS[-1] - BOARD
-    inner = _WIDTH - 2.0 * BOARD
-    pieces = [((_DEPTH, _WIDTH, BOARD), (0.0, 0.0, z)) for z in (bottom, top)]
-    pieces += [((_DEPTH - BACK, inner, BOARD), (0.5 * BACK, 0.0, z - BOARD)) for z in TIERS[1:-1]]
-    height = top - TIERS[0]
-    sides = [((_DEPTH, BOARD, height), (0.0, s * 0.5 * (inner + BOARD), TIERS[0])) for s in (-1.0, 1.0)]
-    back = ((BACK, inner, height), (0.5 * (BACK - _DEPTH), 0.0, TIERS[0]))
-    oak, edge, pale = (198, 160, 112), (176, 136, 90), (222, 192, 148)
-    grain = [Patch(0.0, z, 1.0, z + 0.02, (190, 151, 104)) for z in (0.12, 0.31, 0.55, 0.74, 0.9)]
-    upright = [Patch(x, 0.0, x + 0.03, 1.0, (190, 151, 104)) for x in (0.15, 0.4, 0.62, 0.85)]
-    visual = join(
-        *(
-            painted_box(size, {"-x": edge, "+x": edge, "-y": edge, "+y": edge, "bottom": oak, "top": oak},
-                        {"top": grain}, base=base, front="+x")
-            for size, base in pieces
-        ),
-        *(
-            painted_box(size, {"-x": edge, "+x": edge, "-y": oak, "+y": oak, "bottom": oak, "top": oak},
-                        {"-y": upright, "+y": upright}, base=base)
-            for size, base in sides
-        ),
-        painted_box(back[0], pale, base=back[1]),
-    )  # fmt: skip
-    parts = [box(size, base) for size, base in (*pieces, *sides, back)]
-    return Model(visual, parts, parts)
-
-
-@asset_recipe("book", display_name="book", mass=0.45, color=(30, 64, 140))
-def book() -> Model:
-    """A thick book that stands upright, its spine toward +x."""
-    size = (0.14, 0.05, 0.21)
-    cover, cream, paper, line = (186, 66, 50), (246, 236, 212), (240, 232, 214), (222, 210, 186)
-    board, inset = 0.003, 0.004
-    aside = 0.5 * (size[1] - board)
-    front = [
-        Patch(0.10, 0.58, 0.90, 0.90, cream),
-        *lettering(0.18, 0.78, 0.82, 0.86, cover, (1, 0.8, 1)),
-        *lettering(0.18, 0.66, 0.82, 0.74, cover, (1, 1, 0.8, 1)),
-        Patch(0.28, 0.22, 0.72, 0.46, (92, 148, 84)),
-        Patch(0.36, 0.28, 0.64, 0.40, (236, 184, 72)),
-        *lettering(0.22, 0.09, 0.78, 0.13, cream, (1, 1, 1, 1, 0.8, 1, 1)),
-    ]
-    spine = [
-        Patch(0.0, 0.90, 1.0, 0.93, cream),
-        Patch(0.0, 0.07, 1.0, 0.10, cream),
-        *(Patch(0.30, z, 0.72, z + h, cream) for z, h in ((0.30, 0.07), (0.385, 0.05), (0.45, 0.07), (0.535, 0.05))),
-        Patch(0.24, 0.70, 0.78, 0.80, (236, 184, 72)),
-    ]
-    blurb = [
-        Patch(0.12, z, 0.88 - 0.2 * (k == 0), z + 0.018, cream) for k, z in enumerate(np.arange(0.46, 0.86, 0.055))
-    ]
-    blurb += [Patch(0.58, 0.08, 0.88, 0.20, cream)]
-    blurb += lettering(0.62, 0.10, 0.84, 0.18, (60, 50, 44), (0.4, 0.7, 0.3, 0.5, 0.8, 0.4, 0.6))
-    sheets = [Patch(x, 0.0, x + 0.06, 1.0, line) for x in np.arange(0.04, 0.95, 0.15)]
-    pages = (size[0] - board - inset, size[1] - 2.0 * board, size[2] - 2.0 * inset)
-    visual = join(
-        painted_box((size[0], board, size[2]), cover, {"-y": front}, base=(0.0, -aside, 0.0)),
-        painted_box((size[0], board, size[2]), cover, {"+y": blurb}, base=(0.0, aside, 0.0)),
-        painted_box((board, pages[1], size[2]), cover, {"+x": spine}, base=(0.5 * (size[0] - board), 0.0, 0.0)),
-        painted_box(pages, paper, {"-x": sheets, "top": sheets}, base=(0.5 * (inset - board), 0.0, inset), front="+x"),
-    )  # fmt: skip
-    part = box(size)
-    return Model(visual, [part], [part])
-
-
-@asset_recipe("lamp", display_name="lamp", mass=0.08, color=(255, 238, 130))
-def lamp() -> Model:
-    """A small table lamp, 0.10 m high: a base 0.04 m across, a stem and a shade 0.056 m across."""
-    brass, linen, trim, bulb = (190, 150, 84), (248, 232, 196), (214, 178, 120), (255, 246, 214)
-    base = solid([(0.020, 0.0), (0.020, 0.006), (0.012, 0.012)], 16)
-    stem = solid([(0.004, 0.012), (0.004, 0.052)], 8)
-    shade = solid([(0.028, 0.052), (0.017, 0.10)], 16)
-    visual = join(
-        lathe([(0.0, 0.0), (0.0195, 0.0), (0.020, 0.001), (0.020, 0.006), (0.015, 0.009), (0.012, 0.012),
-               (0.006, 0.0135), (0.004, 0.018), (0.0055, 0.024), (0.004, 0.030), (0.0035, 0.054)], brass, segments=28),
-        lathe([(0.0, 0.054), (0.025, 0.054), (0.0278, 0.052), (0.028, 0.0525), (0.0272, 0.056), (0.0179, 0.096),
-               (0.017, 0.0995), (0.0165, 0.10), (0.0, 0.098)],
-              [bulb, trim, trim, trim, linen, trim, trim, bulb], segments=32),
-    )  # fmt: skip
-    return Model(visual, [base, stem, shade], [hull_of([base, stem, shade])])
 
 
 @asset_recipe("speaker", display_name="speaker", mass=0.60, color=(72, 44, 100))
@@ -236,3 +100,80 @@ def speaker() -> Model:
         painted_box((0.042, 0.0012, 0.018), badge, base=(0.0, -0.0346, 0.029)),
     )
     return Model(visual, [part], [part])
+
+
+def _bulge(radius: float, z: float, height: float, rounding: float, samples: int) -> Profile:
+    """The rounded outside of a disc from ``z`` up, m."""
+    angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, samples)
+    return [(radius - rounding * (1.0 - np.cos(a)), z + 0.5 * height * (1.0 + np.sin(a))) for a in angles]
+
+
+@asset_recipe("stacking_ring", display_name="stacking ring", mass=0.25, color=(255, 96, 16))
+def stacking_ring() -> Model:
+    """Five rings on a base, with a ball on top; 0.08 m across, 0.13 m high."""
+    wood: Color = (232, 206, 162)
+    base = solid([(0.040, 0.0), (0.040, _BASE)], 16)
+    levels = [_BASE + _RING * i for i in range(6)]
+    rings = [solid(_bulge(r, z, _RING, 0.006, 3), 12) for (r, _), z in zip(_RINGS, levels, strict=False)]
+    low = levels[5]
+    ball = solid([(0.008, low), (0.0125, low + 0.008), (0.0110, low + 0.017), (0.006, _HEIGHT)], 10)
+    turns = np.linspace(-0.85, 0.5 * np.pi, 12)
+    middle, radius = low + 0.0098, _HEIGHT - low - 0.0098
+    head = [(radius * max(np.cos(a), 0.0), middle + radius * np.sin(a)) for a in turns[:-1]] + [(0.0, _HEIGHT)]
+    visual = join(
+        lathe([(0.0, 0.0), (0.038, 0.0), (0.040, 0.002), (0.040, _BASE - 0.002), (0.038, _BASE), (0.0, _BASE)], wood),
+        *(
+            lathe([(0.0, z), *_bulge(r, z, _RING, 0.007, 7), (0.0, z + _RING)], color, segments=28)
+            for (r, color), z in zip(_RINGS, levels, strict=False)
+        ),
+        lathe([(0.0, low), (0.0065, low), *head], (238, 82, 92), segments=24),
+    )
+    return Model(visual, [base, *rings, ball], [hull_of([base, *rings]), ball])
+
+
+@asset_recipe("toy_train", display_name="toy train", mass=0.10, color=(44, 92, 228))
+def toy_train() -> Model:
+    """A small locomotive that runs toward +x; its wheels stand on a flat slab."""
+    blue, red, black, gold = (46, 104, 196), (206, 52, 46), (44, 46, 52), (240, 196, 70)
+    deck, roof, axis, radius = 0.025, 0.055, 0.0375, 0.0125
+    wheels = box((0.078, 0.036, 0.013))
+    body = box((0.09, 0.04, deck - 0.013), (0.0, 0.0, 0.013))
+    cab = box((0.034, 0.038, roof - deck), (-0.026, 0.0, deck))
+    boiler = convex_hull(
+        solid([(radius, -0.009), (radius, 0.043)], 12, np.pi / 12).vertices @ _TO_X.T + [0.0, 0.0, axis]
+    )
+    feet = [
+        [x, y, deck] for x in boiler.bounds[:, 0] for y in (-0.006, 0.006)
+    ]  # under its middle: it rests on the deck
+    boiler = convex_hull(np.concatenate([boiler.vertices, feet]))
+    wheel = lathe([(0.0, -0.004), (0.0088, -0.004), (0.009, 0.0), (0.0, 0.0)], [black, black, red], segments=20)
+    hub = lathe([(0.0035, 0.0), (0.0, 0.0012)], gold, segments=12)
+    to_y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    window = [Patch(0.26, 0.48, 0.74, 0.84, (190, 224, 240))]
+    visual = join(
+        painted_box((0.074, 0.022, 0.007), black, base=(0.0, 0.0, 0.006)),
+        painted_box((0.09, 0.04, 0.004), red, base=(0.0, 0.0, 0.013)),
+        painted_box((0.088, 0.038, 0.008), blue, base=(0.0, 0.0, 0.017)),
+        painted_box((0.032, 0.034, 0.026), blue, {"-y": window, "+y": window, "+x": window, "-x": window},
+                    base=(-0.026, 0.0, deck)),
+        painted_box((0.034, 0.038, 0.004), red, base=(-0.026, 0.0, 0.051)),
+        moved(
+            lathe(
+                [(0.0, -0.010), (radius, -0.010), (radius, 0.018), (radius + 0.0004, 0.018), (radius + 0.0004, 0.022),
+                 (radius, 0.022), (radius, 0.040), (0.011, 0.043), (0.0, 0.043)],
+                [black, blue, gold, gold, gold, blue, black, black],
+                segments=28,
+            ),
+            _TO_X,
+            (0.0, 0.0, axis),
+        ),
+        lathe([(0.0045, 0.046), (0.0045, 0.0525), (0.0058, 0.0535), (0.0058, 0.0545), (0.0, 0.0545)], black,
+              segments=16),
+        *(
+            moved(mesh, to_y @ np.diag([1.0, side, side]), (x, side * 0.018, 0.009))
+            for x in (-0.027, 0.027)
+            for side in (1.0, -1.0)
+            for mesh in (wheel, hub)
+        ),
+    )  # fmt: skip
+    return Model(visual, [wheels, body, cab, boiler], [hull_of([wheels, body]), hull_of([cab, boiler])])

@@ -1,0 +1,308 @@
+"""Every entry of the schemas of COLLADA, glTF, USD and MJCF changes what is loaded, is named in the report, is refused,
+or is left out for a reason that stands here. Those of URDF and SDF are in ``test_user_library_references.py``."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+from scene_envs.assets.importing.build import AssetEntry, build_asset
+from scene_envs.errors import SceneEnvsError
+from tests.helpers.model_files import POINTS, block, dae, gltf, triangles
+
+CUBE = "box 0.2 0.1 0.04"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SCENE_ENVS_CACHE", str(tmp_path_factory.mktemp("cache")))
+
+
+def outcome(path: Path) -> tuple[Any, ...] | str:
+    """What an import makes of a file, with what it says; the error where it is refused."""
+    try:
+        asset, report = build_asset(path, AssetEntry(path.name, "it", "it", "its", decomposition="convex"))
+    except SceneEnvsError as error:
+        return str(error)
+    look = asset.visual
+    return (
+        asset.mass, asset.center_of_mass.tobytes(), asset.inertia.tobytes(), asset.static, look.vertices.tobytes(),
+        look.visual.vertex_colors.tobytes(), [part.vertices.tobytes() for part in asset.fine],
+        report.notes + report.warnings,
+    )  # fmt: skip
+
+
+def silent(plain: Path, changed: dict[str, Path]) -> set[str]:
+    """The names of changed files of which the import says and makes what it does of the plain one."""
+    expected = outcome(plain)
+    assert not isinstance(expected, str), expected
+    return {name for name, path in changed.items() if outcome(path) == expected}
+
+
+# -- COLLADA --------------------------------------------------------------------------------------
+
+collada = pytest.importorskip("collada")
+XSD = "{http://www.w3.org/2001/XMLSchema}"
+WALKED = ("COLLADA", "node", "geometry", "mesh", "visual_scene", "instance_geometry", "bind_material")
+HELD = '<instance_geometry url="#g"/>'
+INSIDE = {  # content with which an element says something
+    "lookat": "1 2 3 0 0 0 0 0 1", "matrix": "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "rotate": "0 0 1 30", "scale": "2 1 1",
+    "skew": "30 0 1 0 1 0 0", "translate": "0 0 3", "instance_geometry": "", "node": f"<scale>3 1 1</scale>{HELD}",
+    "evaluate_scene": '<render camera_node="#n"/>',
+    "lines": '<input semantic="VERTEX" source="#v" offset="0"/><p>0 1</p>',
+    "triangles": '<input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p>',
+}  # fmt: skip
+STRIPS = ("linestrips", "tristrips", "trifans", "polygons", "polylist")
+LEFT_OUT = {
+    "who made it": "asset extra param technique technique_common name sid type layer version xml:base camera_node "
+    "render evaluate_scene",
+    "no bodies": "library_animation_clips library_animations library_cameras library_lights library_force_fields "
+    "instance_camera instance_light instance_effect",
+    "nothing refers to it": "library_geometries library_nodes library_visual_scenes library_controllers source "
+    "vertices",
+    "looks": "library_effects library_images library_materials bind_material instance_material",
+}
+"""Entries that change nothing on their own. What a library holds is loaded by the elements that refer to it."""
+
+
+def test_each_entry_of_the_schema_of_collada(tmp_path: Path) -> None:
+    root = ElementTree.parse(Path(collada.__file__).parent / "resources" / "schema-1.4.1.xml").getroot()
+    kinds = {element.get("name"): element for element in root.findall(f"{XSD}element")}
+    space = "http://www.collada.org/2005/11/COLLADASchema"
+    ElementTree.register_namespace("", space)
+    text = dae(triangles(block()), block().vertices, bind="<bind_material><technique_common/></bind_material>")
+    (tmp_path / "it.dae").write_text(text)
+    changed = {}
+    for tag in WALKED:
+        entries = [entry for kind in ("element", "attribute") for entry in kinds[tag].iter(XSD + kind)]
+        for name in {entry.get("ref") or entry.get("name") for entry in entries[1:]}:
+            tree = ElementTree.fromstring(text)
+            parent = next(element for element in tree.iter(f"{{{space}}}{tag}"))
+            if name in ("url", "id", "mesh", "scene", "instance_visual_scene"):
+                continue  # of which there is one, in the plain file
+            if name in kinds or name in INSIDE or "instance" in name or tag == "mesh":
+                rows = '<input semantic="VERTEX" source="#v" offset="0"/><vcount>3</vcount><p>0 1 2</p>'
+                inner = INSIDE.get(name, rows if name in STRIPS else "")
+                url = "#g" if name == "instance_geometry" else "#else"
+                where = ' url="#g"' if url == "#g" else ' url="#else"' if "instance" in name else ""
+                count = ' count="1"' if name in (*STRIPS, "lines", "triangles") else ""
+                parent.append(ElementTree.fromstring(f'<{name} xmlns="{space}"{where}{count}>{inner}</{name}>'))
+            else:
+                parent.set(name, "1")
+            path = tmp_path / f"{tag}_{name}.dae"
+            path.write_bytes(ElementTree.tostring(tree))
+            changed[f"{tag}/{name}"] = path
+    reasons = set(" ".join(LEFT_OUT.values()).split())
+    found = silent(tmp_path / "it.dae", changed)
+    assert sorted(name for name in found if name.partition("/")[2] not in reasons) == [], found
+
+
+@pytest.mark.parametrize(("kind", "name"), [("spline", "splines"), ("convex_mesh", "convex meshes")])
+def test_a_geometry_without_triangles_is_refused_by_its_kind(tmp_path: Path, kind: str, name: str) -> None:
+    text = re.sub("<mesh>.*</mesh>", f"<{kind}/>", dae(triangles(block()), block().vertices), flags=re.DOTALL)
+    (tmp_path / "it.dae").write_text(text)
+    assert f"its {name} are left out" in outcome(tmp_path / "it.dae")
+
+
+# -- glTF -----------------------------------------------------------------------------------------
+
+GLTF: dict[str, dict[str, Any]] = {  # the properties of glTF 2.0 and a value that says something
+    "": {"animations": [{}], "cameras": [{"type": "perspective"}], "skins": [{"joints": [0]}], "scene": 1, "extras": {},
+         "scenes": [{"nodes": []}], "images": [{"uri": "lost.png"}], "extensionsUsed": ["KHR_new"], "samplers": [{}],
+         "extensionsRequired": ["KHR_new"], "textures": [{"source": 0}]},
+    "scenes": {"nodes": [1], "name": "s"},
+    "nodes": {"camera": 0, "children": [1, 2], "skin": 0, "matrix": [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
+              "mesh": 1, "rotation": [0.6, 0, 0, 0.8], "scale": [2, 1, 1], "translation": [0, 0, 3], "weights": [1.0],
+              "name": "n", "extensions": {"KHR_new": {}}},
+    "meshes": {"weights": [0.5], "name": "m"},
+    "primitives": {"indices": 2, "material": 1, "targets": [{}], "extensions": {"KHR_new": {}},
+                   **{f"mode {mode}": mode for mode in range(7)}},
+    "attributes": dict.fromkeys(("NORMAL", "TANGENT", "TEXCOORD_1", "COLOR_0", "JOINTS_0", "WEIGHTS_0"), 0),
+    "accessors": {"byteOffset": 12, "count": 7, "sparse": {"count": 1}, "normalized": True, "max": [1, 1, 1],
+                  "min": [0, 0, 0], "name": "a"},
+    "bufferViews": {"byteOffset": 12, "byteStride": 24, "target": 34962},
+    "materials": {"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1]}, "doubleSided": True, "alphaCutoff": 0.1,
+                  "alphaMode": "MASK", "emissiveFactor": [1, 1, 1], "normalTexture": {"index": 0, "texCoord": 1},
+                  "occlusionTexture": {"index": 0}, "emissiveTexture": {"index": 0}},
+    "pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}, "metallicFactor": 0.5,
+                             "roughnessFactor": 0.5, "metallicRoughnessTexture": {"index": 0}},
+}  # fmt: skip
+UNSEEN = {
+    "names": "name extras",
+    "nothing refers to it": ":cameras :textures :samplers",
+    "normals follow from triangles, and looks name second texture coordinates": "NORMAL TANGENT TEXCOORD_1",
+    "a skin that nothing applies": "JOINTS_0 WEIGHTS_0",
+    "morph targets at rest": "targets",
+    "bounds and use follow from the data": "max min target mode&4",
+    "pictures show one opaque colour": "doubleSided alphaCutoff alphaMode emissiveFactor emissiveTexture normalTexture "
+    "occlusionTexture metallicFactor roughnessFactor metallicRoughnessTexture",
+    "cameras": "camera",
+}
+
+
+def test_each_property_of_gltf(tmp_path: Path) -> None:
+    spare = {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"}
+    mesh = {"name": "body", "primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}
+    second = {"name": "other", "primitives": [{"attributes": {"POSITION": 0}, "indices": 2}]}
+    pbr: dict[str, Any] = {"baseColorFactor": [0.5, 0.5, 0.5, 1]}
+    looks = [{"pbrMetallicRoughness": pbr}, {"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1]}}]
+    nodes = [{"mesh": 0, "children": [1]}, {"mesh": 1, "translation": [1, 0, 0]}, {"mesh": 0, "translation": [2, 0, 0]}]
+    header, data = gltf(POINTS, block().faces, meshes=[mesh, second], materials=looks, nodes=nodes[:2])
+    plain = json.loads(header)
+    plain["accessors"].append(spare)
+    (tmp_path / "it.bin").write_bytes(data)
+    changed = {}
+    places: dict[str, Callable[[Any], Any]] = {
+        "": lambda file: file,
+        "primitives": lambda file: file["meshes"][0]["primitives"][0],
+        "attributes": lambda file: file["meshes"][0]["primitives"][0]["attributes"],
+        "pbrMetallicRoughness": lambda file: file["materials"][0]["pbrMetallicRoughness"],
+    }
+    for kind, properties in GLTF.items():
+        for name, value in properties.items():
+            file = copy.deepcopy(plain)
+            place = places[kind](file) if kind in places else file[kind][0]
+            file["nodes"] += nodes[2:] * (name == "children")
+            file |= {"skins": [{}]} if name == "skin" else {}
+            place[name.partition(" ")[0]] = value
+            path = tmp_path / f"{kind}_{name.replace(' ', '_')}.gltf"
+            path.write_text(json.dumps(file))
+            changed[f"{kind}:{name.replace(' ', '&')}"] = path
+    (tmp_path / "it.gltf").write_text(json.dumps(plain))
+    reasons = set(" ".join(UNSEEN.values()).split())
+    found = silent(tmp_path / "it.gltf", changed)
+    assert sorted(name for name in found if not {name, name.partition(":")[2]} & reasons) == [], found
+
+
+# -- USD ------------------------------------------------------------------------------------------
+
+USD_LEFT_OUT = {
+    "of a simulation, not of a body": "simulationOwner startsAsleep gravityDirection gravityMagnitude",
+    "joints are named, and frozen where they are": "body0 body1 breakForce breakTorque collisionEnabled jointEnabled "
+    "excludeFromArticulation localPos0 localPos1 localRot0 localRot1 axis lowerLimit upperLimit coneAngle0Limit "
+    "coneAngle1Limit maxDistance minDistance",
+    "an asset is one body": "filteredPairs colliders filteredGroups invertFilteredGroups mergeGroup",
+}
+USD_VALUES: dict[str, Any] = {
+    "rigidBodyEnabled": False, "kinematicEnabled": True, "collisionEnabled": False, "velocity": (1, 0, 0),
+    "angularVelocity": (1, 0, 0), "approximation": "boundingCube", "mass": 2.0, "density": 300.0, "restitution": 0.5,
+    "dynamicFriction": 0.4, "staticFriction": 0.4, "centerOfMass": (0.01, 0, 0), "diagonalInertia": (1e-3, 1e-3, 1e-3),
+    "principalAxes": None,
+}  # fmt: skip
+
+
+def test_each_property_of_the_physics_of_usd(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Gf, Plug, Usd, UsdGeom, UsdPhysics, UsdShade
+
+    def stage(path: Path) -> Any:
+        stage = Usd.Stage.CreateNew(str(path))
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+        body = UsdGeom.Xform.Define(stage, "/body").GetPrim()
+        mesh = UsdGeom.Mesh.Define(stage, "/body/mesh")
+        mesh.CreatePointsAttr(block().vertices.tolist())
+        mesh.CreateFaceVertexCountsAttr([3] * 12)
+        mesh.CreateFaceVertexIndicesAttr(block().faces.ravel().tolist())
+        material = UsdShade.Material.Define(stage, "/body/material")
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+        for api, prim in (("RigidBody", body), ("Mass", body), ("Collision", mesh), ("MeshCollision", mesh)):
+            getattr(UsdPhysics, f"{api}API").Apply(prim if api in ("RigidBody", "Mass") else prim.GetPrim())
+        UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+        return stage
+
+    stage(tmp_path / "it.usda").Save()
+    registry, changed = Usd.SchemaRegistry(), {}
+    places = {"RigidBodyAPI": "", "MassAPI": "", "CollisionAPI": "/mesh", "MeshCollisionAPI": "/mesh"}
+    known = set(" ".join(USD_LEFT_OUT.values()).split())
+    for kind in Plug.Registry().GetPluginWithName("usdPhysics").metadata["Types"]:
+        name = registry.GetSchemaTypeName(kind)
+        found = registry.FindAppliedAPIPrimDefinition(name) or registry.FindConcretePrimDefinition(name)
+        for key in found.GetPropertyNames() if found else ():
+            short = key.removeprefix("physics:")
+            if not key.startswith("physics:") or "Joint" in kind or short in known - {"collisionEnabled"}:
+                continue
+            path = tmp_path / f"{kind}_{short}.usda"
+            file = stage(path)
+            place = places.get(name.removeprefix("Physics"), "/material")
+            value = Gf.Quatf(0.9, Gf.Vec3f(0.4, 0.1, 0)) if short == "principalAxes" else USD_VALUES[short]
+            attribute = file.GetPrimAtPath(f"/body{place}").GetAttribute(key)
+            attribute.Set(type(attribute.Get())(*value) if isinstance(value, tuple) else value)
+            if short == "principalAxes":
+                file.GetPrimAtPath("/body").GetAttribute("physics:diagonalInertia").Set(Gf.Vec3f(8e-4, 2.7e-3, 3.3e-3))
+            file.Save()
+            changed[short] = path
+    assert len(changed) >= 12
+    assert sorted(silent(tmp_path / "it.usda", changed)) == [], sorted(changed)
+
+
+def test_each_shape_of_usd_is_read_or_named_or_refused(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Tf, Usd, UsdGeom
+
+    registry = Usd.SchemaRegistry()
+    shapes = [kind for kind in Tf.Type.Find(UsdGeom.Gprim).GetAllDerivedTypes() if registry.IsConcrete(kind)]
+    assert len(shapes) >= 12
+    kept = []
+    for kind in shapes:
+        name = registry.GetSchemaTypeName(kind)
+        path = tmp_path / f"{name}.usda"
+        shape = f'{"def Cube" if name != "Mesh" else "def Sphere"} "first" {{ }}\ndef {name} "second" {{ }}'
+        path.write_text(f'#usda 1.0\n( metersPerUnit = 1\n upAxis = "Z" )\n{shape}\n')
+        found = outcome(path)
+        said = found if isinstance(found, str) else " ".join(found[-1])
+        kept += [name] if "/second" not in said else []
+    assert sorted(kept) == ["Capsule", "Cube", "Cylinder", "Sphere"]
+
+
+# -- MJCF -----------------------------------------------------------------------------------------
+
+mujoco = pytest.importorskip("mujoco")
+NAMED = {  # elements of which the report speaks, and a model that has them
+    "texture": '<asset><texture name="t" type="2d" builtin="flat" width="8" height="8"/></asset>',
+    "motor": '<actuator><motor joint="j"/></actuator>',
+    "jointpos": '<sensor><jointpos joint="j"/></sensor>',
+    "fixed": '<tendon><fixed><joint joint="j" coef="1"/></fixed></tendon>',
+    "equality": '<equality><joint joint1="j"/></equality>',
+    "plugin": '<extension><plugin plugin="mujoco.pid"><instance name="p"/></plugin></extension>',
+}
+BODY = 'gravcomp="1"'
+COMPILED = {
+    "MuJoCo compiles them into what is read": "compiler default asset mesh material "
+    "layer hfield model worldbody (world)body frame replicate composite inertial joint freejoint geom attach "
+    "lengthrange mujoco element config instance extension",
+    "of a simulation, not of a body": "option flag size statistic visual global quality headlight map scale rgba "
+    "custom numeric text tuple keyframe key contact pair exclude site camera light deformable",
+    "they are counted in the report": "actuator sensor tendon equality flex flexcomp skin bone edge elasticity pin "
+    "spatial pulley fixed connect weld flexstrain texture plugin",
+}
+
+
+def mjcf(root: str, body: str = "") -> str:
+    return f"""<mujoco><worldbody><body name="b" {body}><geom type="box" size="0.1 0.05 0.02"/>
+<body pos="0 0 0.1"><joint name="j" type="hinge"/><geom type="sphere" size="0.02"/></body></body></worldbody>{root}
+</mujoco>"""
+
+
+def test_each_element_of_mjcf(tmp_path: Path) -> None:
+    """Elements below actuator and sensor are kinds of these."""
+    plain = tmp_path / "it.xml"
+    plain.write_text(mjcf(""))
+    changed = {}
+    for name, text in {**{name: mjcf(text) for name, text in NAMED.items()}, "gravcomp": mjcf("", BODY)}.items():
+        changed[name] = tmp_path / f"{name}.xml"
+        changed[name].write_text(text)
+    assert silent(plain, changed) == set()
+    lines = [line.split() for line in mujoco.mj_printSchema(False, False).splitlines()]
+    rows = [line for line in lines if len(line) > 1 and len(line[1]) == 3 and line[1][0] == "("]
+    start = {name: [row[0] for row in rows].index(name) for name in ("actuator", "sensor", "keyframe")}
+    kinds = {row[0] for row in rows[start["actuator"] : start["keyframe"]]}
+    known = set(" ".join(COMPILED.values()).split())
+    assert sorted({row[0] for row in rows} - kinds - known) == []
