@@ -24,6 +24,7 @@ from agents.networks.geometry import ContactsConfig, RelationsConfig, RotationFe
 from agents.networks.registry import NetworkConfig, network_config
 from agents.networks.text_encoders import VOCABULARY, AnyTextConfig, text_config
 from agents.pretraining.settings import PretrainConfig
+from agents.priors.claim_guidance import names_of
 from agents.priors.config import MixedPriorConfig, PriorConfig
 from agents.priors.continuous import ContinuousPrior, SceneCode
 from agents.priors.files import PriorFacts
@@ -288,9 +289,7 @@ def _modules(config: PretrainConfig, slots: int, text_width: int) -> list[Module
 
 def _kinds(scene: str) -> tuple[int, ...]:
     """The kind of each asset: assets with the same display name are one kind in prompts."""
-    names = [asset.display_name for asset in get_scene_type(scene).library]
-    order = {name: number for number, name in enumerate(dict.fromkeys(names))}
-    return tuple(order[name] for name in names)
+    return tuple(names_of(get_scene_type(scene).library)[1].tolist())
 
 
 def _conditions_counts(config: PretrainConfig) -> bool:

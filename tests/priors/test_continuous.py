@@ -177,7 +177,7 @@ def test_completion_rearrangement_and_inpainting(prior: ContinuousPrior, scenes:
     assert not torch.equal(moved.tensor, scenes.tensor)
     mask = torch.zeros(6, 34, 2, dtype=torch.bool)
     mask[:, 1:4, 0] = mask[:, 3:6, 1] = True
-    changed = prior.inpaint(scenes, mask, num_steps=3, resample=2)
+    changed = prior.inpaint(scenes, mask, num_steps=3)
     untouched = ~mask.any(dim=-1)
     assert torch.equal(changed.tensor[untouched], scenes.tensor[untouched])
     for batch in (fuller, moved, changed):
