@@ -185,8 +185,9 @@ def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> 
         raise InvalidInputError(
             f"text.encoder={config.text.encoder} needs process=mixed: the continuous prior reads no prompts"
         )
-    rotation, moments = config.process.rotation, config.process.moments
-    code = SceneCode(get_scene_type(config.scene), rotation, normalizer)
+    scene_type, rotation = get_scene_type(config.scene), config.process.rotation
+    code = SceneCode(scene_type, rotation, normalizer)
+    moments = Preconditioning.fit(code.encode(SceneBatch(raw[:FITTED_ON], scene_type))[:, len(scene_type.fixed) :])
     prior_config = PriorConfig(
         config.scene,
         raw.shape[1],
@@ -195,9 +196,7 @@ def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> 
         **_chain(config),
     )
     torch.manual_seed(config.seed)
-    return ContinuousPrior.fitted(
-        prior_config, normalizer, raw[:FITTED_ON], "feature" if moments == "category" else moments
-    )
+    return ContinuousPrior(prior_config, normalizer, moments.pooled() if config.process.moments == "scene" else moments)
 
 
 def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]]) -> MixedPrior:

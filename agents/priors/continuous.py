@@ -15,7 +15,7 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from agents.diffusion import GaussianStep, Preconditioning, ReverseStep, StepTable
+from agents.diffusion import GaussianStep, ReverseStep, StepTable
 from agents.diffusion.gaussian import loss_weights
 from agents.networks.denoisers import Denoiser, Observed
 from agents.networks.registry import build_network
@@ -28,10 +28,7 @@ from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.rotations import matrix_to_quaternion, project_to_so3, quaternion_to_matrix
 from scene_envs.scene import CATEGORY, ROTATION, TRANSLATION, SceneBatch
-from scene_envs.scene_types import SceneType, get_scene_type
-
-SCENE_MOMENTS = ("feature", "scene")
-"""Moments that precondition the network of a continuous prior: of each feature, or one standard deviation for all."""
+from scene_envs.scene_types import SceneType
 
 
 class ContinuousPrior(ScenePrior):
@@ -57,25 +54,6 @@ class ContinuousPrior(ScenePrior):
         self.code = SceneCode(self.scene_type, self.config.rotation, self.normalizer)
         _check_network(self.config, self.code)
         return Denoiser(build_network(self.config.network), self.process)
-
-    @classmethod
-    def fitted(
-        cls, config: PriorConfig, normalizer: Normalizer, raw: Tensor, moments: str = "feature"
-    ) -> ContinuousPrior:
-        """A fresh prior whose preconditioning is fitted to raw scenes (M, N, 3 + 9 + C + 1).
-
-        Args:
-            config: its configuration.
-            normalizer: normalizer of raw scenes.
-            raw: scenes in the scene type's layout.
-            moments: one of :data:`SCENE_MOMENTS`: those of each feature, or one standard deviation for all.
-        """
-        if moments not in SCENE_MOMENTS:
-            raise unknown_name("moments of a continuous prior", moments, SCENE_MOMENTS)
-        scene_type = get_scene_type(config.scene_type)
-        code = SceneCode(scene_type, config.rotation, normalizer)
-        fitted = Preconditioning.fit(code.encode(SceneBatch(raw, scene_type))[:, len(scene_type.fixed) :])
-        return cls(config, normalizer, fitted if moments == "feature" else fitted.pooled())
 
     # -- scenes and numbers ---------------------------------------------------------------------
 
@@ -225,7 +203,6 @@ def encode_rotations(matrices: Tensor, rotation: str) -> Tensor:
     >>> encode_rotations(torch.diag(torch.tensor([-1.0, -1.0, 1.0])), "quaternion").tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    _check_rotation(rotation)
     if rotation == "matrix":
         return matrices.flatten(-2)
     quaternion = _canonical(matrix_to_quaternion(matrices.double()))
@@ -244,7 +221,6 @@ def decode_rotations(code: Tensor, rotation: str) -> Tensor:
             [0., 1., 0.],
             [0., 0., 1.]])
     """
-    _check_rotation(rotation)
     if rotation == "matrix":
         return project_to_so3(code.unflatten(-1, (3, 3)))
     if rotation == "axis_angle":
@@ -279,7 +255,8 @@ class SceneCode:
     """
 
     def __init__(self, scene_type: SceneType, rotation: str, normalizer: Normalizer) -> None:
-        _check_rotation(rotation)
+        if rotation not in ROTATIONS:
+            raise unknown_name("rotation", rotation, ROTATIONS)
         self.scene_type, self.rotation = scene_type, rotation
         self.normalizer = normalizer if rotation == "matrix" else _code_normalizer(normalizer, rotation)
 
@@ -319,11 +296,6 @@ class SceneCode:
         rotations = decode_rotations(raw[..., self.rotation_slice], self.rotation)
         categories = x[..., self.pose_width :].argmax(dim=-1)
         return SceneBatch.from_parts(raw[..., TRANSLATION], rotations, categories, self.scene_type)
-
-
-def _check_rotation(rotation: str) -> None:
-    if rotation not in ROTATIONS:
-        raise unknown_name("rotation", rotation, ROTATIONS)
 
 
 def _canonical(quaternion: Tensor) -> Tensor:

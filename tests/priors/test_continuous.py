@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from agents.diffusion import GaussianStep
+from agents.diffusion import GaussianStep, Preconditioning
 from agents.diffusion.reverse_steps import gaussian_log_prob
 from agents.networks import FluxConfig, MixedFluxConfig
 from agents.networks.registry import network_config
@@ -120,7 +120,8 @@ def _prior(rotation: str, scenes: SceneBatch, network: str = "flux") -> Continuo
     config = replace(base.config, network=size, rotation=rotation)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        prior = ContinuousPrior.fitted(config, base.normalizer, scenes.tensor)
+        code = SceneCode(base.scene_type, rotation, base.normalizer)
+        prior = ContinuousPrior(config, base.normalizer, Preconditioning.fit(code.encode(scenes)[:, 1:]))
         for parameter in prior.parameters():
             if not bool(parameter.any()):
                 torch.nn.init.normal_(parameter, std=0.02)
