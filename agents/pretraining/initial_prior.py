@@ -24,6 +24,7 @@ from agents.networks.geometry import ContactsConfig, RelationsConfig, RotationFe
 from agents.networks.registry import NetworkConfig, network_config
 from agents.networks.text_encoders import VOCABULARY, AnyTextConfig, text_config
 from agents.pretraining.settings import PretrainConfig
+from agents.priors.claim_guidance import names_of
 from agents.priors.config import MixedPriorConfig, PriorConfig
 from agents.priors.continuous import ContinuousPrior, SceneCode
 from agents.priors.files import PriorFacts
@@ -184,8 +185,9 @@ def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> 
         raise InvalidInputError(
             f"text.encoder={config.text.encoder} needs process=mixed: the continuous prior reads no prompts"
         )
-    rotation, moments = config.process.rotation, config.process.moments
-    code = SceneCode(get_scene_type(config.scene), rotation, normalizer)
+    scene_type, rotation = get_scene_type(config.scene), config.process.rotation
+    code = SceneCode(scene_type, rotation, normalizer)
+    moments = Preconditioning.fit(code.encode(SceneBatch(raw[:FITTED_ON], scene_type))[:, len(scene_type.fixed) :])
     prior_config = PriorConfig(
         config.scene,
         raw.shape[1],
@@ -194,9 +196,7 @@ def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> 
         **_chain(config),
     )
     torch.manual_seed(config.seed)
-    return ContinuousPrior.fitted(
-        prior_config, normalizer, raw[:FITTED_ON], "feature" if moments == "category" else moments
-    )
+    return ContinuousPrior(prior_config, normalizer, moments.pooled() if config.process.moments == "scene" else moments)
 
 
 def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]]) -> MixedPrior:
@@ -288,9 +288,7 @@ def _modules(config: PretrainConfig, slots: int, text_width: int) -> list[Module
 
 def _kinds(scene: str) -> tuple[int, ...]:
     """The kind of each asset: assets with the same display name are one kind in prompts."""
-    names = [asset.display_name for asset in get_scene_type(scene).library]
-    order = {name: number for number, name in enumerate(dict.fromkeys(names))}
-    return tuple(order[name] for name in names)
+    return tuple(names_of(get_scene_type(scene).library)[1].tolist())
 
 
 def _conditions_counts(config: PretrainConfig) -> bool:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
+from agents.diffusion.categorical import UNMASKINGS
 from agents.networks.registry import NetworkConfig
 from agents.networks.text_encoders import AnyTextConfig
+from scene_envs.errors import Checked, OneOf
 
 PROCESSES = ("continuous", "mixed")
 """Diffusion processes: categories as numbers, or as discrete states."""
+CATEGORY_LOSSES = ("cross_entropy", "bound")
+UNIONS = ("one_type", "any")
+"""Assets that a scene of a union of scene types may hold: those of one of its types, or any."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +81,7 @@ class PriorConfig(PoseDiffusionConfig, DenoiserConfig):
 
 
 @dataclass(frozen=True)
-class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
+class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig, Checked):
     """Configuration of a mixed discrete-continuous prior.
 
     Further fields are those of :class:`DenoiserConfig` and :class:`PoseDiffusionConfig`.
@@ -103,12 +109,12 @@ class MixedPriorConfig(PoseDiffusionConfig, DenoiserConfig):
 
     timesteps: str = "lognormal"
     kernel: str = "mask_and_replace"
-    category_loss: str = "cross_entropy"
+    category_loss: Annotated[str, OneOf(CATEGORY_LOSSES, "category loss")] = "cross_entropy"
     category_weight: float = 0.3
     auxiliary: float = 5e-4
     observed_share: float = 0.3
     open_empty_share: float = 0.0
     text: AnyTextConfig | None = None
     empty_slots: str = "attended"
-    unmasking: str = "even"
-    union: str = "one_type"
+    unmasking: Annotated[str, OneOf(UNMASKINGS)] = "even"
+    union: Annotated[str, OneOf(UNIONS)] = "one_type"

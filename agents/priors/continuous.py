@@ -9,17 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
+import roma
 import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from agents.configuration.composition import check_types
-from agents.diffusion import GaussianStep, Preconditioning, ResidualVariance, ReverseStep, StepTable
+from agents.diffusion import GaussianStep, ReverseStep, StepTable
 from agents.diffusion.gaussian import loss_weights
 from agents.networks.denoisers import Denoiser, Observed
-from agents.networks.registry import build_network, config_from_state
+from agents.networks.registry import build_network
 from agents.networks.text import Text
 from agents.priors.config import PriorConfig
 from agents.priors.guidance import Hook
@@ -29,10 +28,7 @@ from scene_envs.normalizer import Normalizer
 from scene_envs.protocols import StepTableLike
 from scene_envs.rotations import matrix_to_quaternion, project_to_so3, quaternion_to_matrix
 from scene_envs.scene import CATEGORY, ROTATION, TRANSLATION, SceneBatch
-from scene_envs.scene_types import SceneType, get_scene_type
-
-SCENE_MOMENTS = ("feature", "scene")
-"""Moments that precondition the network of a continuous prior: of each feature, or one standard deviation for all."""
+from scene_envs.scene_types import SceneType
 
 
 class ContinuousPrior(ScenePrior):
@@ -42,13 +38,6 @@ class ContinuousPrior(ScenePrior):
     For ``"matrix"`` it has the scene type's own layout; for the others it is narrower. :meth:`encode` and
     :meth:`decode` convert scenes to x and back.
 
-    Args:
-        config: its configuration.
-        normalizer: normalizer of raw scenes in the scene type's layout.
-        preconditioning: moments (D,) of encoded scenes.
-        card: facts about its training.
-        residual: (G, D) measured error of the denoised scene.
-
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="continuous")
     >>> mean, std = prior.posterior(prior.initial(2, 34), 0, prior.step_table(4))
@@ -57,46 +46,14 @@ class ContinuousPrior(ScenePrior):
     """
 
     process_name = "continuous"
+    config_type = PriorConfig
+    code: SceneCode
+    """Scenes as numbers, and back."""
 
-    def __init__(
-        self,
-        config: PriorConfig,
-        normalizer: Normalizer,
-        preconditioning: Preconditioning,
-        card: dict[str, Any] | None = None,
-        residual: ResidualVariance | None = None,
-    ) -> None:
-        super().__init__()
-        self.code = SceneCode(get_scene_type(config.scene_type), config.rotation, normalizer)
-        _check_network(config, self.code)
-        self._keep(config, normalizer, preconditioning, card, residual)
-        self.denoiser = Denoiser(build_network(config.network), self.process)
-
-    @classmethod
-    def fitted(
-        cls, config: PriorConfig, normalizer: Normalizer, raw: Tensor, moments: str = "feature"
-    ) -> ContinuousPrior:
-        """A fresh prior whose preconditioning is fitted to raw scenes (M, N, 3 + 9 + C + 1).
-
-        Args:
-            config: its configuration.
-            normalizer: normalizer of raw scenes.
-            raw: scenes in the scene type's layout.
-            moments: one of :data:`SCENE_MOMENTS`: those of each feature, or one standard deviation for all.
-        """
-        if moments not in SCENE_MOMENTS:
-            raise unknown_name("moments of a continuous prior", moments, SCENE_MOMENTS)
-        scene_type = get_scene_type(config.scene_type)
-        code = SceneCode(scene_type, config.rotation, normalizer)
-        fitted = Preconditioning.fit(code.encode(SceneBatch(raw, scene_type))[:, len(scene_type.fixed) :])
-        return cls(config, normalizer, fitted if moments == "feature" else fitted.pooled())
-
-    @classmethod
-    def config_from_state(cls, fields: dict[str, Any]) -> PriorConfig:
-        """The configuration in the ``prior`` entry of a file."""
-        fields = {**fields, "network": config_from_state(fields["network"], "continuous")}
-        check_types(PriorConfig, fields)
-        return PriorConfig(**fields)
+    def _denoiser(self) -> Denoiser:
+        self.code = SceneCode(self.scene_type, self.config.rotation, self.normalizer)
+        _check_network(self.config, self.code)
+        return Denoiser(build_network(self.config.network), self.process)
 
     # -- scenes and numbers ---------------------------------------------------------------------
 
@@ -134,16 +91,6 @@ class ContinuousPrior(ScenePrior):
 
     def transition(self, x_t: Tensor, step: int, table: StepTableLike, *, eta: float = 1.0) -> GaussianStep:
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters."""
-        return self._reverse(x_t, step, table, eta)
-
-    def posterior(self, x_t: Tensor, step: int, table: StepTableLike, eta: float = 1.0) -> tuple[Tensor, Tensor]:
-        """Mean (B, N, D) and std (N, D) of x_{t-1} given x_t; differentiable in the network's parameters.
-
-        The std is 0 on known entries. All entries are 0 at the last step, which is deterministic, and if ``eta`` is 0.
-        """
-        return self._reverse(x_t, step, table, eta)[:2]
-
-    def _reverse(self, x_t: Tensor, step: int, table: StepTableLike, eta: float) -> GaussianStep:
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         self.process.check_stride(t, previous)
         x0 = self.denoiser(x_t, t)
@@ -153,11 +100,18 @@ class ContinuousPrior(ScenePrior):
         mean = self.clamp(x0_weight * x0 + xt_weight * x_t)
         return GaussianStep(mean, std * self.frame(x_t).moving, x0.detach())
 
+    def posterior(self, x_t: Tensor, step: int, table: StepTableLike, eta: float = 1.0) -> tuple[Tensor, Tensor]:
+        """Mean (B, N, D) and std (N, D) of x_{t-1} given x_t; differentiable in the network's parameters.
+
+        The std is 0 on known entries. All entries are 0 at the last step, which is deterministic, and if ``eta`` is 0.
+        """
+        return self.transition(x_t, step, table, eta=eta)[:2]
+
     @torch.no_grad()
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
-        observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
-        eta: float = 1.0, hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
+        observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, eta: float = 1.0,
+        hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D), as :meth:`ScenePrior.run_chain` describes it; there is no text, and ``guidance`` is not read.
 
@@ -165,18 +119,13 @@ class ContinuousPrior(ScenePrior):
         """
         kept = None if observed is None else observed.entries(self.pose_width)
         for step in range(first, len(table)):
-            level, after = table.timesteps[step], int(table.previous[step])
-            rounds = resample if after > 0 else 1
-            for again in range(rounds):
-                if again:
-                    x = self.process.renoise(x, after, int(level), draw_noise(x, noises))
-                if observed is not None and kept is not None:
-                    noised = self.process.add_noise(observed.x, level, draw_noise(x, noises))
-                    x = self.clamp(torch.where(kept, noised, x))
-                reverse: ReverseStep = self.transition(x, step, table, eta=eta)
-                if hook is not None and again == rounds - 1:
-                    reverse = hook(step, x, reverse)
-                x = reverse.from_noise(draw_noise(x, noises))
+            if observed is not None and kept is not None:
+                noised = self.process.add_noise(observed.x, table.timesteps[step], draw_noise(x, noises))
+                x = self.clamp(torch.where(kept, noised, x))
+            reverse: ReverseStep = self.transition(x, step, table, eta=eta)
+            if hook is not None:
+                reverse = hook(step, x, reverse)
+            x = reverse.from_noise(draw_noise(x, noises))
         if closed is not None:
             barred = F.pad(closed[:, None].expand(*x.shape[:2], -1), (self.pose_width, 0))
             x = x.masked_fill(barred, torch.finfo(x.dtype).min)
@@ -254,11 +203,12 @@ def encode_rotations(matrices: Tensor, rotation: str) -> Tensor:
     >>> encode_rotations(torch.diag(torch.tensor([-1.0, -1.0, 1.0])), "quaternion").tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    _check_rotation(rotation)
     if rotation == "matrix":
         return matrices.flatten(-2)
     quaternion = _canonical(matrix_to_quaternion(matrices.double()))
-    return (quaternion if rotation == "quaternion" else _to_axis_angle(quaternion)).to(matrices.dtype)
+    if rotation == "axis_angle":
+        return roma.unitquat_to_rotvec(quaternion.roll(-1, dims=-1), shortest_arc=False).to(matrices.dtype)
+    return quaternion.to(matrices.dtype)
 
 
 def decode_rotations(code: Tensor, rotation: str) -> Tensor:
@@ -271,11 +221,11 @@ def decode_rotations(code: Tensor, rotation: str) -> Tensor:
             [0., 1., 0.],
             [0., 0., 1.]])
     """
-    _check_rotation(rotation)
     if rotation == "matrix":
         return project_to_so3(code.unflatten(-1, (3, 3)))
-    numbers = code.double()
-    quaternion = numbers if rotation == "quaternion" else _from_axis_angle(numbers)
+    if rotation == "axis_angle":
+        return roma.rotvec_to_rotmat(code.double()).to(code.dtype)
+    quaternion = code.double()
     none = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64, device=code.device)
     zero = quaternion.norm(dim=-1, keepdim=True) < _ZERO
     return quaternion_to_matrix(torch.where(zero, none, quaternion)).to(code.dtype)
@@ -305,7 +255,8 @@ class SceneCode:
     """
 
     def __init__(self, scene_type: SceneType, rotation: str, normalizer: Normalizer) -> None:
-        _check_rotation(rotation)
+        if rotation not in ROTATIONS:
+            raise unknown_name("rotation", rotation, ROTATIONS)
         self.scene_type, self.rotation = scene_type, rotation
         self.normalizer = normalizer if rotation == "matrix" else _code_normalizer(normalizer, rotation)
 
@@ -347,11 +298,6 @@ class SceneCode:
         return SceneBatch.from_parts(raw[..., TRANSLATION], rotations, categories, self.scene_type)
 
 
-def _check_rotation(rotation: str) -> None:
-    if rotation not in ROTATIONS:
-        raise unknown_name("rotation", rotation, ROTATIONS)
-
-
 def _canonical(quaternion: Tensor) -> Tensor:
     """q or -q of quaternions (..., 4), which are one rotation: that with w >= 0; for half turns, the axis decides."""
     w, axis = quaternion[..., 0], quaternion[..., 1:]
@@ -359,22 +305,6 @@ def _canonical(quaternion: Tensor) -> Tensor:
     leading = axis.gather(-1, first).squeeze(-1)
     negative = torch.where(w.abs() < _HALF_TURN, leading < 0, w < 0)
     return torch.where(negative[..., None], -quaternion, quaternion)
-
-
-def _to_axis_angle(quaternion: Tensor) -> Tensor:
-    """(..., 3) axis times angle of unit quaternions (..., 4)."""
-    w, vector = quaternion[..., :1], quaternion[..., 1:]
-    length = vector.norm(dim=-1, keepdim=True)
-    tiny = length < _ZERO  # sin(angle / 2), where angle / length tends to 2
-    scale = 2.0 * torch.atan2(length, w) / torch.where(tiny, torch.ones_like(length), length)
-    return torch.where(tiny, 2.0 * vector, scale * vector)
-
-
-def _from_axis_angle(vector: Tensor) -> Tensor:
-    """Unit quaternions (..., 4) of axis times angle (..., 3)."""
-    angle = vector.norm(dim=-1, keepdim=True)
-    sine_over_angle = 0.5 * torch.sinc(angle / (2.0 * math.pi))  # sin(angle / 2) / angle
-    return torch.cat([torch.cos(angle / 2), sine_over_angle * vector], dim=-1)
 
 
 def _code_normalizer(normalizer: Normalizer, rotation: str) -> Normalizer:

@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from agents.diffusion.categorical import one_hot
-from agents.diffusion.gaussian import StepTable
 from agents.diffusion.reverse_steps import MixedStep, ReverseStep, state_of
-from agents.priors.claim_guidance import ClaimGuidance, claims_of, names_of
+from agents.priors.claim_guidance import claims_of, names_of
 from scene_envs.arrays import constant_on
 from scene_envs.datasets.prompts.claims import (
     Claim,
@@ -29,9 +28,8 @@ from scene_envs.datasets.prompts.claims import (
     SupportCount,
 )
 from scene_envs.envs.settings import check_physics_guidance
-from scene_envs.normalizer import Normalizer
 from scene_envs.physics.correction import corrections
-from scene_envs.scene import POSE_FEATURES, TRANSLATION, SceneBatch
+from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
 # -- hooks ----------------------------------------------------------------------------------------
@@ -61,38 +59,17 @@ watch has a method ``see(step, steps, x)``, the method is called with x_t (B, N,
 """
 
 
-class Estimating(Protocol):
-    """A prior, as far as hooks need it."""
-
-    normalizer: Normalizer
-    scene_type: SceneType
-
-    @property
-    def device(self) -> torch.device:
-        """Device of the weights."""
-
-    def estimate(self, step: int, table: StepTable) -> tuple[float, Tensor]:
-        """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised."""
-
-
-def position_std(prior: Estimating, step: int, table: StepTable) -> Tensor:
-    """(3,) standard deviation of the denoised positions at a step of a chain, m, on the CPU; 0 without extent."""
-    _, std = prior.estimate(step, table)
-    scale = prior.normalizer.scale[TRANSLATION].to(std)
-    return torch.where(scale == 0, torch.zeros_like(scale), std / scale)
-
-
 # -- physics --------------------------------------------------------------------------------------
 
 
-_FINE = 0.03
+_FINE = 0.02
 """Error (m) of horizontal positions below which objects are moved; above it, overlaps are not known yet."""
 
 
 class PhysicsGuidance:
     """Moves the objects of each scene out of overlaps and onto supports, at the last steps of the denoising.
 
-    From the step on at which the horizontal error of the denoised positions is below 3 cm, objects that overlap in the
+    From the step on at which the horizontal error of the denoised positions is below 2 cm, objects that overlap in the
     denoised scene come apart, and floating ones come down, by ``strength`` times the moves of
     :func:`~scene_envs.physics.correction.corrections`. The following steps adapt the scene to the moves. At the last
     step the moves change the sample itself.
@@ -283,9 +260,6 @@ def _of_reference(reference: Reference) -> Iterator[tuple[str, float, float]]:
     yield reference.name, max(2, reference.ordinal) if reference.ordinal else 1, 1 if only else math.inf
 
 
-# -- one hook of all guidance ---------------------------------------------------------------------
-
-
 def physics_strength(given: float | None, config: Any, scene_type: SceneType) -> float:
     """The strength that a caller gives, or else that of a prior's configuration.
 
@@ -295,64 +269,3 @@ def physics_strength(given: float | None, config: Any, scene_type: SceneType) ->
     strength = config.physics_guidance if given is None else given
     check_physics_guidance(strength, scene_type)
     return float(strength)
-
-
-def guidance_hook(
-    prior: Estimating,
-    table: StepTable,
-    scenes: Callable[[Tensor], SceneBatch],
-    moved: Tensor,
-    prompts: Sequence[str] | None,
-    claim_guidance: float,
-    physics_guidance: float,
-    guide: Guide | None = None,
-    watch: Watch | None = None,
-) -> Hook | None:
-    """The hook of one chain under guidance; None if nothing watches or guides it.
-
-    At a step it calls ``watch.see``, number guidance, ``guide``, claim guidance, physics guidance, and ``watch``.
-
-    Args:
-        prior: prior that denoises.
-        table: the chain.
-        scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
-        moved: (B, N, 1) bool, slots whose poses are denoised.
-        prompts: one per scene; without prompts there is no claim guidance.
-        claim_guidance: strength, 0 for none.
-        physics_guidance: strength, 0 for none.
-        guide, watch: callables of the caller.
-    """
-    scale, moved = (there.to(prior.device) for there in (prior.normalizer.scale[TRANSLATION], moved))
-    movable = moved.squeeze(-1)
-    guides: list[Guide] = [] if guide is None else [guide]
-    draw = None
-    if prompts is not None and claim_guidance:
-        guides.append(ClaimGuidance(prompts, prior.scene_type, claim_guidance, movable))
-        draw = NumberGuidance(prompts, prior.scene_type)
-    if physics_guidance:
-        guides.append(PhysicsGuidance(physics_guidance, movable))
-    see = getattr(watch, "see", None)
-    errors = [position_std(prior, step, table) for step in range(len(table))] if guides else []
-    there = torch.stack(errors).to(prior.device) if guides else scale
-
-    def hook(step: int, x: Tensor, reverse: ReverseStep) -> ReverseStep:
-        estimate = reverse.denoised
-        if see is not None:
-            see(step, len(table), x)
-        if draw is not None:
-            reverse = draw(x, reverse)
-        if estimate is None:
-            return reverse
-
-        def denoised() -> SceneBatch:
-            return scenes(estimate)
-
-        for each in guides:
-            acts = getattr(each, "acts", None)
-            shift = each(step, len(table), denoised, there[step]) if acts is None or acts(errors[step]) else None
-            if shift is not None:
-                reverse = reverse.shifted(prior.estimate(step, table)[0] * scale * shift.to(scale) * moved)
-        rows = None if watch is None else watch(step, len(table), denoised)
-        return reverse if rows is None else reverse.take(rows.to(x.device))
-
-    return None if watch is None and draw is None and not guides else hook

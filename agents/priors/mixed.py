@@ -7,28 +7,25 @@ While a category is masked its K entries are zeros. (Pfaff et al., CoRL 2025; Hu
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from agents.configuration.composition import check_types
-from agents.diffusion import CategoricalProcess, MixedStep, Preconditioning, ResidualVariance, StepTable
-from agents.diffusion.categorical import UNMASKINGS, make_categorical_schedule, one_hot
+from agents.diffusion import CategoricalProcess, MixedStep, StepTable
+from agents.diffusion.categorical import make_categorical_schedule, one_hot
 from agents.diffusion.gaussian import loss_weights
 from agents.diffusion.reverse_steps import ReverseStep, state_of
 from agents.networks.denoisers import MixedDenoiser, Observed
 from agents.networks.flux_modules import CountConditioning
-from agents.networks.registry import build_network, config_from_state
+from agents.networks.registry import build_network
 from agents.networks.text import PADDING, Text, TextEncoder, vocabulary, warn_unknown
-from agents.networks.text_encoders import text_config_from_state, text_encoder
+from agents.networks.text_encoders import text_encoder
 from agents.priors.config import MixedPriorConfig
 from agents.priors.guidance import Hook
 from agents.priors.prior import (
-    UNIONS,
     DenoiserOutput,
     NoisedScenes,
     ScenePrior,
@@ -39,13 +36,10 @@ from agents.priors.prior import (
 from scene_envs.arrays import constant_on
 from scene_envs.datasets.prompts.facts import SIDES
 from scene_envs.datasets.prompts.parser import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns
-from scene_envs.errors import InvalidInputError, unknown_name
-from scene_envs.normalizer import Normalizer
+from scene_envs.errors import InvalidInputError
 from scene_envs.protocols import StepTableLike
 from scene_envs.scene import POSE_FEATURES, SceneBatch
-from scene_envs.scene_types import SceneType, get_scene_type, members_of
-
-CATEGORY_LOSSES = ("cross_entropy", "bound")
+from scene_envs.scene_types import SceneType, members_of
 
 _TEXT = "text_encoder."
 
@@ -58,18 +52,9 @@ _COUNT_WEIGHT = 0.5
 _AT_ONCE = 32
 """Scenes whose residual is measured in one batch: features of all pairs of slots of 512 rooms would be gigabytes."""
 
-Prior = TypeVar("Prior", bound="MixedPrior")
-
 
 class MixedPrior(ScenePrior):
     """A :class:`~agents.priors.prior.ScenePrior` whose categories are discrete.
-
-    Args:
-        config: its configuration.
-        normalizer: normalizer of raw scenes; only its pose features are used.
-        preconditioning: moments (12,) of normalised poses.
-        card: facts about its training.
-        residual: (G, 12) measured error of the denoised pose.
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="mixed")
@@ -80,52 +65,26 @@ class MixedPrior(ScenePrior):
     """
 
     process_name = "mixed"
+    config_type = MixedPriorConfig
     config: MixedPriorConfig
     denoiser: MixedDenoiser
     categories: CategoricalProcess
     """The process of the categories."""
 
-    def __init__(
-        self,
-        config: MixedPriorConfig,
-        normalizer: Normalizer,
-        preconditioning: Preconditioning,
-        card: dict[str, Any] | None = None,
-        residual: ResidualVariance | None = None,
-    ) -> None:
-        super().__init__()
-        scene_type = get_scene_type(config.scene_type)
-        if config.network.categories != scene_type.num_assets + 1:
+    def _denoiser(self) -> MixedDenoiser:
+        config, count = self.config, self.scene_type.num_assets + 1
+        if config.network.categories != count:
             raise InvalidInputError(
-                f"the network knows {config.network.categories} categories, {config.scene_type!r} has "
-                f"{scene_type.num_assets + 1} with empty"
+                f"the network knows {config.network.categories} categories, {config.scene_type!r} has {count} with "
+                "empty"
             )
-        if config.category_loss not in CATEGORY_LOSSES:
-            raise unknown_name("category loss", config.category_loss, CATEGORY_LOSSES)
-        if config.unmasking not in UNMASKINGS:
-            raise unknown_name("unmasking", config.unmasking, UNMASKINGS)
-        if config.union not in UNIONS:
-            raise unknown_name("union", config.union, UNIONS)
         if config.empty_slots == "dropped" and not getattr(config.network, "reads_slot_mask", False):
             raise InvalidInputError("empty_slots='dropped' needs network='flux'; others take empty_slots='attended'")
-        self._keep(config, normalizer, preconditioning, card, residual)
-        self.categories = CategoricalProcess(
-            make_categorical_schedule(config.kernel, config.num_timesteps), config.network.categories
-        )
+        self.categories = CategoricalProcess(make_categorical_schedule(config.kernel, config.num_timesteps), count)
         self._together = config.unmasking != "independent" and self.categories.only_absorbs
         self._systematic = config.unmasking == "systematic" and self._together
         encoder = None if config.text is None else text_encoder(config.text)
-        self.denoiser = MixedDenoiser(
-            build_network(config.network), self.process, self.categories, encoder, config.empty_slots
-        )
-
-    @classmethod
-    def config_from_state(cls, fields: dict[str, Any]) -> MixedPriorConfig:
-        """The configuration in the ``prior`` entry of a file."""
-        text = text_config_from_state(fields.get("text"))
-        fields = {**fields, "network": config_from_state(fields["network"], "mixed"), "text": text}
-        check_types(MixedPriorConfig, fields)
-        return MixedPriorConfig(**fields)
+        return MixedDenoiser(build_network(config.network), self.process, self.categories, encoder, config.empty_slots)
 
     def weights(self) -> dict[str, Tensor]:
         """Tensors of the network, and those of the text encoder under ``text_encoder.``."""
@@ -252,17 +211,6 @@ class MixedPrior(ScenePrior):
         fixed[:, : len(self.scene_type.fixed)] = True
         return Observed(x, fixed, fixed)
 
-    def with_union(self: Prior, union: str) -> Prior:
-        """Restrict the scenes of a union, as :meth:`ScenePrior.with_union` does."""
-        super().with_union(union)
-        self.config = replace(self.config, union=union)
-        return self
-
-    def with_open_empty(self: Prior, share: float) -> Prior:
-        """Set the share of training masks that open every empty slot, as :meth:`ScenePrior.with_open_empty` does."""
-        self.config = replace(self.config, open_empty_share=share)
-        return self
-
     def initial_from_noise(self, noise: Tensor) -> Tensor:
         """x_T (B, N, D) from ``noise``: normal poses, and categories drawn from their distribution at T."""
         probs = self.categories.prior().to(noise).expand(*noise.shape[:2], -1)
@@ -386,29 +334,20 @@ class MixedPrior(ScenePrior):
     @torch.no_grad()
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
-        observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
-        eta: float = 1.0, hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
+        observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, eta: float = 1.0,
+        hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D), as :meth:`ScenePrior.run_chain` describes it; observed entries carry no noise."""
         free = self.unconditional(len(x)) if text is None or guidance else None
         x = x if observed is None else observed.write(x)
         for step in range(first, len(table)):
-            level, after = int(table.timesteps[step]), int(table.previous[step])
-            rounds = resample if after > 0 else 1
-            for again in range(rounds):
-                if again:
-                    noise = draw_noise(x, noises)  # for a sample of q(x_t | x_s), s = after < t = level
-                    pose = self.process.renoise(x[..., :POSE_FEATURES], after, level, noise[..., :POSE_FEATURES])
-                    rows = self.categories.transition(after, level).to(x)[state_of(x[..., POSE_FEATURES:])]
-                    x = self.clamp(self.with_states(pose, rows, noise))
-                    x = x if observed is None else observed.write(x)
-                reverse: ReverseStep = self.transition(
-                    x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta, closed=closed
-                )
-                if hook is not None and again == rounds - 1:
-                    reverse = hook(step, x, reverse)
-                x = reverse.from_noise(draw_noise(x, noises))
-                x = x if observed is None else observed.write(x)
+            reverse: ReverseStep = self.transition(
+                x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta, closed=closed
+            )
+            if hook is not None:
+                reverse = hook(step, x, reverse)
+            x = reverse.from_noise(draw_noise(x, noises))
+            x = x if observed is None else observed.write(x)
         return x
 
     # -- training ---------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,16 +13,27 @@ from typing import Any, NamedTuple, TypeVar, cast
 import torch
 from torch import Generator, Tensor, nn
 
+from agents.configuration.composition import check_types
 from agents.configuration.prior_names import joint_name, split_name
 from agents.diffusion import GaussianProcess, Preconditioning, ResidualVariance, ReverseStep, StepTable
 from agents.diffusion.gaussian import check_weighting, make_schedule, timestep_distribution, timestep_weights
 from agents.networks.denoisers import Observed, check_precision
 from agents.networks.flux_modules import CountConditioning
-from agents.networks.registry import config_state
+from agents.networks.registry import config_from_state, config_state
 from agents.networks.text import Text
+from agents.networks.text_encoders import text_config_from_state
 from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
+from agents.priors.claim_guidance import ClaimGuidance
+from agents.priors.config import UNIONS
 from agents.priors.files import StoredPrior, explained, read_stored, write_stored
-from agents.priors.guidance import Guide, Hook, Watch, guidance_hook, physics_strength
+from agents.priors.guidance import (
+    Guide,
+    Hook,
+    NumberGuidance,
+    PhysicsGuidance,
+    Watch,
+    physics_strength,
+)
 from scene_envs.arrays import constant_on, within_memory
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.envs.settings import check_claim_guidance, check_guidance, check_physics_guidance
@@ -32,9 +43,6 @@ from scene_envs.protocols import StepTableLike
 from scene_envs.scene import CATEGORY, POSE, POSE_FEATURES, TRANSLATION, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 from scene_envs.supports import welded_mask
-
-UNIONS = ("one_type", "any")
-"""Assets that a scene of a union of scene types may hold: those of one of its types, or any."""
 
 Prompt = str | Sequence[str] | None
 """One text for all scenes, one per scene, or None for anything."""
@@ -116,6 +124,13 @@ class ScenePrior(nn.Module, ABC):
     out of the loss and of every log-probability. The two kinds of prior are
     :class:`~agents.priors.continuous.ContinuousPrior` and :class:`~agents.priors.mixed.MixedPrior`.
 
+    Args:
+        config: its configuration.
+        normalizer: normalizer of raw scenes in the scene type's layout; a mixed prior uses its pose features alone.
+        preconditioning: moments (F,) of what the network denoises, normalised: poses, or whole slots.
+        card: facts about its training.
+        residual: (G, F) measured error of what the network denoises.
+
     In inpainting, the network of a mixed prior reads the observed entries without noise. That of a continuous prior
     reads them with the noise of each level (Lugmayr et al. 2022, Eq. 8).
 
@@ -127,8 +142,10 @@ class ScenePrior(nn.Module, ABC):
 
     process_name = ""
     """Name of the process in configuration files; a subclass that sets it can be loaded by :meth:`load`."""
+    config_type: type[Any]
+    """Class of its configuration, a dataclass."""
     config: Any
-    """Configuration of the prior, a dataclass."""
+    """Its configuration."""
     scene_type: SceneType
     normalizer: Normalizer
     preconditioning: Preconditioning
@@ -150,15 +167,15 @@ class ScenePrior(nn.Module, ABC):
         if cls.process_name:
             _CLASSES[cls.process_name] = cls
 
-    def _keep(
+    def __init__(
         self,
         config: Any,
         normalizer: Normalizer,
         preconditioning: Preconditioning,
-        card: dict[str, Any] | None,
-        residual: ResidualVariance | None,
+        card: dict[str, Any] | None = None,
+        residual: ResidualVariance | None = None,
     ) -> None:
-        """Store the parts that priors of every process have, and make the process of their continuous features."""
+        super().__init__()
         check_weighting(config.loss_weighting, config.prediction)
         self.config = config
         self.scene_type = get_scene_type(config.scene_type)
@@ -167,14 +184,19 @@ class ScenePrior(nn.Module, ABC):
         self.preconditioning = preconditioning
         self.card = card or {}
         self.residual = residual
-        fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
-        self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
-        self._frames: dict[Any, Frame] = {}
-        self._strides: dict[Any, tuple[ResidualVariance | None, tuple[float, float, Tensor]]] = {}
         schedule = make_schedule(config.schedule, config.num_timesteps, config.noise_floor, config.noise_ceiling)
         self.process = GaussianProcess(schedule, config.prediction, preconditioning)
         distribution = timestep_distribution(config.timesteps, config.prediction)
         self._timestep_weights = timestep_weights(distribution, schedule, config.noise_mean, config.noise_std)
+        self.denoiser = self._denoiser()
+        fixed = SceneBatch.empty(self.scene_type, 1, len(self.scene_type.fixed) or 1)
+        self.register_buffer("_fixed", self.normalised(fixed)[0], persistent=False)
+        self._frames: dict[Any, Frame] = {}
+        self._strides: dict[Any, tuple[ResidualVariance | None, tuple[float, float, Tensor]]] = {}
+
+    @abstractmethod
+    def _denoiser(self) -> nn.Module:
+        """The network inside its process, once the configuration fits the scene type."""
 
     @property
     def device(self) -> torch.device:
@@ -243,9 +265,13 @@ class ScenePrior(nn.Module, ABC):
         return {**asdict(self.config), "network": config_state(self.config.network)}
 
     @classmethod
-    @abstractmethod
     def config_from_state(cls, fields: dict[str, Any]) -> Any:
         """Inverse of :meth:`config_state`, also after a trip through JSON."""
+        fields = {**fields, "network": config_from_state(fields["network"], cls.process_name)}
+        if "text" in fields:
+            fields["text"] = text_config_from_state(fields["text"])
+        check_types(cls.config_type, fields)
+        return cls.config_type(**fields)
 
     def weights(self) -> dict[str, Tensor]:
         """Trained tensors by name, as a prior's file holds them."""
@@ -369,6 +395,8 @@ class ScenePrior(nn.Module, ABC):
         """
         if union not in UNIONS:
             raise unknown_name("union", union, UNIONS)
+        if hasattr(self.config, "union"):
+            self.config = replace(self.config, union=union)
         return self
 
     def with_physics_guidance(self: Prior, strength: float) -> Prior:
@@ -406,6 +434,8 @@ class ScenePrior(nn.Module, ABC):
 
         A prior whose network reads no observed entries has no such masks and is not changed.
         """
+        if hasattr(self.config, "open_empty_share"):
+            self.config = replace(self.config, open_empty_share=share)
         return self
 
     # -- the reverse chain ------------------------------------------------------------------------
@@ -435,6 +465,11 @@ class ScenePrior(nn.Module, ABC):
         """Weight of the denoised translations in x_{t-1}, and their standard deviation (3,), normalised, on the CPU."""
         weight, std = self.process.estimate(int(table.timesteps[step]), int(table.previous[step]), self.residual)
         return weight, std[TRANSLATION]
+
+    def position_std(self, step: int, table: StepTable) -> Tensor:
+        """(3,) standard deviation of the denoised positions at a step of a chain, m, on the CPU; 0 without extent."""
+        scale = self.normalizer.scale[TRANSLATION].cpu()
+        return torch.where(scale == 0, torch.zeros_like(scale), self.estimate(step, table)[1] / scale)
 
     @torch.no_grad()
     def sample(
@@ -490,8 +525,8 @@ class ScenePrior(nn.Module, ABC):
     @abstractmethod
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
-        observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, resample: int = 1,
-        eta: float = 1.0, hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
+        observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, eta: float = 1.0,
+        hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) from x_T, with observed entries kept. No gradient passes.
 
@@ -502,8 +537,7 @@ class ScenePrior(nn.Module, ABC):
             observed: entries that are kept.
             text: tokens (B, L, W) and mask (B, L) of the prompts; None without.
             guidance, eta: settings of :meth:`sample`.
-            resample: number of times that each step is taken, with noise added again in between.
-            hook: hook that is called at the last time that each step is taken.
+            hook: hook that is called at every step.
             first: step that the chain begins at.
             closed: (B, K) bool, categories that slots that are not observed do not take.
         """
@@ -525,7 +559,57 @@ class ScenePrior(nn.Module, ABC):
         moved = torch.ones(count, slots, 1, dtype=torch.bool)
         moved[:, : len(self.scene_type.fixed)] = False
         table = self.step_table(num_steps)
-        return guidance_hook(self, table, self.decode, moved, prompts, claim_guidance, physics_guidance)
+        return self.guidance_hook(table, self.decode, moved, prompts, claim_guidance, physics_guidance)
+
+    def guidance_hook(
+        self, table: StepTable, scenes: Callable[[Tensor], SceneBatch], moved: Tensor, prompts: Sequence[str] | None,
+        claim_guidance: float, physics_guidance: float, guide: Guide | None = None, watch: Watch | None = None,
+    ) -> Hook | None:  # fmt: skip
+        """The hook of one chain under guidance; None if nothing watches or guides it.
+
+        At a step it calls ``watch.see``, number guidance, ``guide``, claim guidance, physics guidance, and ``watch``.
+
+        Args:
+            table: the chain.
+            scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
+            moved: (B, N, 1) bool, slots whose poses are denoised.
+            prompts: one per scene; without prompts there is no claim guidance.
+            claim_guidance: strength, 0 for none.
+            physics_guidance: strength, 0 for none.
+            guide, watch: callables of the caller.
+        """
+        scale, moved = (there.to(self.device) for there in (self.normalizer.scale[TRANSLATION], moved))
+        guides: list[Guide] = [] if guide is None else [guide]
+        draw = None
+        if prompts is not None and claim_guidance:
+            guides.append(ClaimGuidance(prompts, self.scene_type, claim_guidance, moved.squeeze(-1)))
+            draw = NumberGuidance(prompts, self.scene_type)
+        if physics_guidance:
+            guides.append(PhysicsGuidance(physics_guidance, moved.squeeze(-1)))
+        if watch is None and draw is None and not guides:
+            return None
+        see = getattr(watch, "see", None)
+        errors = [self.position_std(step, table) for step in range(len(table))] if guides else []
+        there = torch.stack(errors).to(self.device) if guides else scale
+
+        def hook(step: int, x: Tensor, reverse: ReverseStep) -> ReverseStep:
+            estimate = reverse.denoised
+            if see is not None:
+                see(step, len(table), x)
+            if draw is not None:
+                reverse = draw(x, reverse)
+            if estimate is None:
+                return reverse
+            denoised = partial(scenes, estimate)
+            for each in guides:
+                acts = getattr(each, "acts", None)
+                shift = each(step, len(table), denoised, there[step]) if acts is None or acts(errors[step]) else None
+                if shift is not None:
+                    reverse = reverse.shifted(self.estimate(step, table)[0] * scale * shift.to(scale) * moved)
+            rows = None if watch is None else watch(step, len(table), denoised)
+            return reverse if rows is None else reverse.take(rows.to(x.device))
+
+        return hook
 
     # -- inpainting -------------------------------------------------------------------------------
 
@@ -533,7 +617,7 @@ class ScenePrior(nn.Module, ABC):
     def inpaint(
         self, batch: SceneBatch, mask: Tensor, *, prompt: Prompt = None, guidance: float = 0.0,
         claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50,
-        generators: Sequence[Generator] | None = None, seed: int = 0, resample: int = 1, watch: Watch | None = None,
+        generators: Sequence[Generator] | None = None, seed: int = 0, watch: Watch | None = None,
         guide: Guide | None = None,
     ) -> SceneBatch:  # fmt: skip
         """Regenerate the masked entries, given the rest.
@@ -546,18 +630,10 @@ class ScenePrior(nn.Module, ABC):
             mask: bool, True where something is regenerated: (B, N) for whole slots, or (B, N, 2) for the pose and the
                 category of each slot. Fixed welded slots are never regenerated.
             prompt: text that says what the whole scenes should hold in the end, one for all or one per scene.
-            guidance: w of classifier-free guidance, (1 + w) conditional - w unconditional; it needs a prompt.
-            claim_guidance: strength of guidance to the claims of the prompt, see
-                :class:`~agents.priors.claim_guidance.ClaimGuidance` and
-                :class:`~agents.priors.guidance.NumberGuidance`; it needs a prompt.
-            physics_guidance: strength with which regenerated objects are moved out of overlaps and onto supports at the
-                last steps, 0 to 1, see :class:`~agents.priors.guidance.PhysicsGuidance`. None takes the
-                strength of the prior, as :meth:`ScenePrior.sample` does.
-            num_steps: denoiser evaluations of one pass, 1..T.
+            guidance, claim_guidance, physics_guidance: arguments of :meth:`sample`; regenerated objects are moved.
+            num_steps: denoiser evaluations, 1..T.
             generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
             seed: seed of the generators, where none are given.
-            resample: number of times that each step is taken, with noise added again in between (Lugmayr et al. 2022,
-                Algorithm 1).
             watch: called at every step; chooses the scenes that continue. A scene may be replaced only by one with the
                 same rows of ``batch`` and ``mask``.
             guide: moves the poses that are regenerated.
@@ -567,11 +643,11 @@ class ScenePrior(nn.Module, ABC):
             alone is regenerated, an object stays an object and an empty slot stays empty, as the pose is kept.
 
         Raises:
-            InvalidInputError: a mask of the wrong shape or type, not one generator per scene, ``resample`` below 1, a
-                prompt for a prior that reads none, guidance without a prompt, ``claim_guidance`` below 0, or
-                ``physics_guidance`` outside 0 to 1.
+            InvalidInputError: a mask of the wrong shape or type, not one generator per scene, a prompt for a prior
+                that reads none, guidance without a prompt, ``claim_guidance`` below 0, or ``physics_guidance`` outside
+                0 to 1.
         """
-        both = check_mask(batch, mask, generators, resample).to(batch.tensor.device)
+        both = check_mask(batch, mask, generators).to(batch.tensor.device)
         both[:, : len(self.scene_type.fixed)] = False
         prompts = self._check_prompts(prompt, guidance, claim_guidance, len(batch), batch.tensor.shape[1])
         strength = physics_strength(physics_guidance, self.config, self.scene_type)
@@ -582,7 +658,7 @@ class ScenePrior(nn.Module, ABC):
         def scenes(x: Tensor) -> SceneBatch:
             return merge(batch, self.decode(x).to(batch.tensor.device), both)
 
-        hook = guidance_hook(self, table, scenes, both[..., :1], prompts, claim_guidance, strength, guide, watch)
+        hook = self.guidance_hook(table, scenes, both[..., :1], prompts, claim_guidance, strength, guide, watch)
         text = None if prompts is None else self.encode_prompts(prompts)
         given, changed = batch.to(self.device), both.to(self.device)
         observed = Observed(self.encode(given), ~changed[..., 0], ~changed[..., 1])
@@ -592,9 +668,7 @@ class ScenePrior(nn.Module, ABC):
         if start is not None:
             first, x = start[0], start[1].to(x)
         closed = self.closed_categories(given, changed)
-        x = self.run_chain(
-            x, table, generators, observed, text, guidance, resample, hook=hook, first=first, closed=closed
-        )
+        x = self.run_chain(x, table, generators, observed, text, guidance, hook=hook, first=first, closed=closed)
         return scenes(x)
 
     def _check_prompts(
@@ -762,9 +836,7 @@ def draw_noise(like: Tensor, generators: Sequence[Generator] | Generator | None)
 # -- masks -----------------------------------------------------------------------------------------
 
 
-def check_mask(
-    batch: SceneBatch, mask: Tensor, generators: Sequence[Generator] | None = None, resample: int = 1
-) -> Tensor:
+def check_mask(batch: SceneBatch, mask: Tensor, generators: Sequence[Generator] | None = None) -> Tensor:
     """The mask as (B, N, 2), a copy; raises InvalidInputError when an argument does not fit ``batch``."""
     expected = tuple(batch.tensor.shape[:2])
     if tuple(mask.shape) not in (expected, (*expected, 2)) or mask.dtype != torch.bool:
@@ -774,8 +846,6 @@ def check_mask(
         )
     if generators is not None and len(generators) != len(batch):
         raise InvalidInputError(f"{len(generators)} generators for {len(batch)} scenes; give one per scene")
-    if resample < 1:
-        raise InvalidInputError(f"resample={resample}: every step is taken at least once")
     return (mask if mask.ndim == 3 else torch.stack([mask, mask], dim=-1)).clone()
 
 

@@ -247,8 +247,8 @@ class _Parts(NamedTuple):
         largest, place = torch.where((low - high[:, None]).abs_() < _TOUCHING, area, 0.0).flatten(0, 1).max(dim=0)
         pair, most = torch.nonzero(largest > 0)[:, 0], len(things.geometry.part)
         parts = _Parts(pair, lower[pair], upper[pair], place[pair] // most, place[pair] % most)
-        spans = [parts.spans(things, axis) for axis in range(3)]
-        middle = torch.stack([torch.maximum(a[0], b[0]) + torch.minimum(a[1], b[1]) for a, b in spans]) / 2
+        one, two = parts.boxes(things)
+        middle = (torch.maximum(one[0], two[0]) + torch.minimum(one[1], two[1])) / 2
         outside = torch.zeros_like(middle[0])
         for rows, sides in parts.groups(things):
             for table, row, turn, origin in sides:
@@ -295,11 +295,9 @@ class _Parts(NamedTuple):
         second objects have gone ``way`` (3, P) m: sides of the boxes of parts where these are then apart, of which the
         nearest one of each object pair is enough, and face planes elsewhere.
         """
-        sides, axes = [], _AXES.to(way)
-        for axis in range(3):
-            (low_a, high_a), (low_b, high_b) = self.spans(things, axis)
-            sides += [low_b - high_a, low_a - high_b]
-        gap, side, after = _met(torch.stack(sides), axes[..., None], _at(way, self.pair))
+        axes, (one, two) = _AXES.to(way), self.boxes(things)
+        sides = torch.stack([two[0] - one[1], one[0] - two[1]], dim=1).flatten(0, 1)
+        gap, side, after = _met(sides, axes[..., None], _at(way, self.pair))
         crossing = (after < -_FLOATING) | (side < 4)
         count = 6 * way.shape[1]
         nearest = gap.new_full((count + 1,), torch.inf)
@@ -313,11 +311,11 @@ class _Parts(NamedTuple):
         normal = torch.cat([axes[rows % 6].T, normal], dim=1)
         return torch.cat([rows // 6, others.pair]), torch.cat([nearest[rows], gap]), normal
 
-    def spans(self, things: _Things, axis: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """(Q,) m, lowest and highest coordinate of both parts along an axis, from the first object on."""
-        away = things.translation[axis, self.second] - things.translation[axis, self.first]
-        low, high = things.boxes[:, axis, self.two, self.second] + away
-        return tuple(things.boxes[:, axis, self.one, self.first]), (low, high)
+    def boxes(self, things: _Things) -> tuple[Tensor, Tensor]:
+        """(2, 3, Q) m each, lowest and highest corners of the boxes of both parts, from the first object on."""
+        away = _at(things.translation, self.second) - _at(things.translation, self.first)
+        boxes, count = things.boxes.flatten(2), len(things.at)
+        return _at(boxes, self.one * count + self.first), _at(boxes, self.two * count + self.second) + away
 
 
 def _met(gaps: Tensor, normals: Tensor, way: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -479,39 +477,44 @@ def _ways_out(things: _Things, first: Tensor, second: Tensor, bounds: Tensor, co
     rows = torch.nonzero((overlap > _DEEP).all(dim=0))[:, 0]
     parts = _Parts.near(things, first[rows], second[rows], -_DEEP, -_DEEP)
     parts = parts._replace(pair=rows[parts.pair])
-    groups = list(parts.gaps(things))
-    gap, normal = bounds.new_empty(len(parts.pair)), bounds.new_empty(3, len(parts.pair))
-    for rows, gaps, normals in groups:
-        gap[rows], best = gaps.max(dim=0)
-        normal[:, rows] = _chosen(normals, best)
-    deepest = torch.zeros_like(offset[0]).scatter_reduce(0, parts.pair, gap, "amin")
+    groups = []
+    for some, gaps, normals in parts.gaps(things):
+        gap, best = gaps.max(dim=0)
+        groups.append((parts.pair[some], gap, _chosen(normals, best), gaps, normals))
+    if not groups:
+        return torch.zeros_like(offset)
+    pair, gap, normal = (torch.cat(columns, dim=-1) for columns in list(zip(*groups, strict=True))[:3])
+    deepest = torch.zeros_like(offset[0]).scatter_reduce(0, pair, gap, "amin")
     shallow = torch.full_like(deepest, -torch.inf)
-    shallow = shallow.scatter_reduce(0, parts.pair, torch.where(gap < 0, gap, -torch.inf), "amax")
-    level = offset * offset.new_tensor([1.0, 1.0, 0.0])[:, None]
+    shallow = shallow.scatter_reduce(0, pair, torch.where(gap < 0, gap, -torch.inf), "amax")
+    deep = torch.nonzero(deepest < -_DEEP)[:, 0]
+    place = torch.full_like(first, len(deep)).index_put_((deep,), torch.arange(len(deep), device=deep.device))
+    level = _at(offset, deep) * offset.new_tensor([1.0, 1.0, 0.0])[:, None]
     level = torch.where(level.norm(dim=0) > 1e-6, level, offset.new_tensor([1.0, 0.0, 0.0])[:, None])
-    level = F.pad(level / level.norm(dim=0), (0, 1))  # the last column is of no pair
+    level = F.pad(level / level.norm(dim=0), (0, 1))  # the last column is of all other pairs
     axes = _AXES.to(offset)[..., None].expand(-1, -1, level.shape[1])
     directions = torch.cat([axes, torch.stack([level, -level, level, level])])
     for found, extreme in zip(directions[-2:], (deepest, shallow), strict=True):
-        found[:, torch.where(gap == extreme[parts.pair], parts.pair, len(first))] = normal
+        found[:, torch.where(gap == extreme[pair], place[pair], len(deep))] = normal
     directions = directions[..., :-1]
-    enter, leave = gap.new_empty(2, len(directions), len(gap))
-    for rows, gaps, normals in groups:
-        some = _at(directions, parts.pair[rows])
-        speed = _dot(some[:, None].unbind(dim=2), normals.unbind(dim=1)).sub_(projection.STILL)  # (D, K, q)
-        when, nearer = -gaps / speed, speed < 0
-        enter[:, rows] = torch.where(nearer, when, -torch.inf).amax(dim=1)
-        leave[:, rows] = when.masked_fill_(nearer, torch.inf).amin(dim=1)
-    pair = parts.pair.expand_as(leave)
+    passes = []
+    for owner, _, _, gaps, normals in groups:
+        kept = torch.nonzero(place[owner] < len(deep))[:, 0]
+        owner, gaps, normals = place[owner[kept]], _at(gaps, kept), _at(normals, kept)
+        speed = _dot(_at(directions, owner)[:, None].unbind(dim=2), normals.unbind(dim=1)).sub_(projection.STILL)
+        when, nearer = -gaps / speed, speed < 0  # (D, K, q)
+        enter = torch.where(nearer, when, -torch.inf).amax(dim=1)
+        passes.append((owner.expand_as(enter), enter, when.masked_fill_(nearer, torch.inf).amin(dim=1)))
+    owner, enter, leave = (torch.cat(columns, dim=1) for columns in zip(*passes, strict=True))
     length = torch.zeros_like(directions[:, 0])
     for _ in range(_SWEEPS):
-        here = _at(length, parts.pair) + _MET
-        length = length.scatter_reduce(1, pair, torch.where((enter < here) & (leave > here), leave, 0.0), "amax")
+        here = length.gather(1, owner) + _MET
+        length = length.scatter_reduce(1, owner, torch.where((enter < here) & (leave > here), leave, 0.0), "amax")
     length = length.clamp(max=projection.FAR)
-    price = _weights(things, (first, second), directions, length, bounds) * (directions * cost[:, None]).norm(dim=1)
-    best = (length * price).argmin(dim=0)
+    price = _weights(things, (first[deep], second[deep]), directions, length, bounds)
+    best = (length * price * (directions * cost[:, None]).norm(dim=1)).argmin(dim=0)
     way = _chosen(directions, best) * (length.gather(0, best[None]) + projection.CLEARANCE)
-    return torch.where(deepest < -_DEEP, way, 0.0)
+    return torch.zeros_like(offset).index_copy_(1, deep, way)
 
 
 def _weights(
@@ -579,16 +582,16 @@ def _solved(ends: Tensor, direction: Tensor, needed: Tensor, found: Tensor, limi
     places, size = ends.expand(3, -1), direction.abs()
     planes = torch.zeros_like(limits[0]).scatter_add_(1, places, size) * (limits[0] < limits[1])
     step = 1.0 / ((size * _at(planes, ends)).sum(dim=0).view(2, -1).sum(dim=0) + projection.SLACK**-2)
-    kept, target = 1.0 - step * projection.SLACK**-2, step * needed
+    kept, target, count = 1.0 - step * projection.SLACK**-2, step * needed, len(needed)
 
     def moved(multipliers: Tensor) -> Tensor:
-        pull = direction * multipliers.repeat(2)
+        pull = (direction.view(3, 2, count) * multipliers).view(3, -1)
         return torch.zeros_like(limits[0]).scatter_add_(1, places, pull).clamp_(limits[0], limits[1])
 
     ahead, momentum = found, 1.0
     for _ in range(_STEPS):
-        offset = (direction * _at(moved(ahead), ends)).sum(dim=0).view(2, -1).sum(dim=0)
-        new = torch.addcmul(ahead * kept + target, step, offset, value=-1.0).clamp_(min=0.0)
+        offset = (direction * _at(moved(ahead), ends)).view(6, count).sum(dim=0)
+        new = torch.addcmul(target, ahead, kept).addcmul_(step, offset, value=-1.0).clamp_(min=0.0)
         following = 0.5 * (1.0 + (1.0 + 4.0 * momentum**2) ** 0.5)
         ahead = torch.lerp(found, new, 1.0 + (momentum - 1.0) / following)
         found, momentum = new, following

@@ -385,16 +385,14 @@ def test_words_of_groups_are_those_of_the_parts_they_are_for():
     from agents.networks.denoisers import EMPTY_SLOTS
     from agents.networks.flux import TEXT_REACHES
     from agents.pretraining.settings import FluxSettings, LossSettings, ProcessSettings
-    from agents.priors.config import PROCESSES
-    from agents.priors.continuous import ROTATION_WIDTHS, SCENE_MOMENTS
-    from agents.priors.mixed import CATEGORY_LOSSES
+    from agents.priors.config import CATEGORY_LOSSES, PROCESSES
+    from agents.priors.continuous import ROTATION_WIDTHS
 
     assert tuple(MEASURES) == MEASURE_NAMES
     for make, key, known in (
         (ProcessSettings, "name", PROCESSES),
         (ProcessSettings, "prediction", PREDICTIONS),
         (ProcessSettings, "schedule", _SCHEDULES),
-        (ProcessSettings, "moments", ("category", *SCENE_MOMENTS)),
         (ProcessSettings, "rotation", ROTATION_WIDTHS),
         (ProcessSettings, "kernel", CATEGORICAL_KERNELS),
         (ProcessSettings, "empty_slots", EMPTY_SLOTS),

@@ -15,7 +15,6 @@ from torch import Generator
 from agents import ScenePrior
 from agents.post_training import GuidanceDistillationLoss, PostTrainer
 from agents.post_training.algorithms.guidance_distillation import GuidanceDistillation
-from agents.priors.guidance import position_std
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics.correction import corrections
@@ -81,7 +80,7 @@ def test_targets_are_the_corrections_of_what_the_sampler_denoises(trainer: PostT
     torch.testing.assert_close(states["scene"], found["scene"][:, step])
     with torch.no_grad():
         reverse: Any = prior.transition(found["scene"][:, step], step, table)
-    std = position_std(prior, step, table)  # type: ignore[arg-type]
+    std = prior.position_std(step, table)
     moves = corrections(prior.decode(reverse.denoised), std)
     expected = reverse.denoised[..., :POSE_FEATURES].clone()
     expected[..., TRANSLATION] += prior.normalizer.scale[TRANSLATION] * moves
@@ -101,7 +100,7 @@ def test_no_target_is_further_than_the_clip(trainer: PostTrainer) -> None:
         learner.settings.clip = 1e-9
         own = learner.corrected(found, at)["denoised"]
         scale = learner.sampler.normalizer.scale[TRANSLATION]
-        std = position_std(learner.sampler, step, trainer.learner.policy.table)  # type: ignore[arg-type]
+        std = learner.sampler.position_std(step, trainer.learner.policy.table)  # type: ignore[arg-type]
         far = ((near - own)[..., TRANSLATION] / scale / std).norm(dim=-1)
         assert float(far.max()) <= 0.5 + 1e-3
 
@@ -123,7 +122,7 @@ def test_the_prior_comes_nearer_to_guided_samples(trainer: PostTrainer) -> None:
 def test_a_prior_that_knows_no_position_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     prior = tiny_prior()
     monkeypatch.setattr(type(prior), "estimate", lambda *_: (0.5, torch.full((3,), 0.5)))
-    with pytest.raises(InvalidInputError, match=r"known to 3 cm.*num_steps=12"):
+    with pytest.raises(InvalidInputError, match=r"known to 2 cm.*num_steps=12"):
         PostTrainer(small_config(tmp_path, num_steps=STEPS, algorithm={"name": NAME}), prior=prior)
 
 
@@ -136,8 +135,8 @@ def test_values_that_cannot_be_are_named(tmp_path: Path, keys: dict[str, Any]) -
 def test_steps_are_those_at_which_the_guidance_acts(trainer: PostTrainer) -> None:
     learner = algorithm(trainer)
     stds = [
-        float(position_std(learner.sampler, step, trainer.learner.policy.table)[:2].max())  # type: ignore[arg-type]
+        float(learner.sampler.position_std(step, trainer.learner.policy.table)[:2].max())  # type: ignore[arg-type]
         for step in range(STEPS)
     ]
-    assert learner.steps == np.flatnonzero(np.array(stds) <= 0.03).tolist()
+    assert learner.steps == np.flatnonzero(np.array(stds) <= 0.02).tolist()
     assert 0 < len(learner.steps) < STEPS

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from agents.diffusion import GaussianStep
+from agents.diffusion import GaussianStep, Preconditioning
 from agents.diffusion.reverse_steps import gaussian_log_prob
 from agents.networks import FluxConfig, MixedFluxConfig
 from agents.networks.registry import network_config
@@ -120,7 +120,8 @@ def _prior(rotation: str, scenes: SceneBatch, network: str = "flux") -> Continuo
     config = replace(base.config, network=size, rotation=rotation)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        prior = ContinuousPrior.fitted(config, base.normalizer, scenes.tensor)
+        code = SceneCode(base.scene_type, rotation, base.normalizer)
+        prior = ContinuousPrior(config, base.normalizer, Preconditioning.fit(code.encode(scenes)[:, 1:]))
         for parameter in prior.parameters():
             if not bool(parameter.any()):
                 torch.nn.init.normal_(parameter, std=0.02)
@@ -177,7 +178,7 @@ def test_completion_rearrangement_and_inpainting(prior: ContinuousPrior, scenes:
     assert not torch.equal(moved.tensor, scenes.tensor)
     mask = torch.zeros(6, 34, 2, dtype=torch.bool)
     mask[:, 1:4, 0] = mask[:, 3:6, 1] = True
-    changed = prior.inpaint(scenes, mask, num_steps=3, resample=2)
+    changed = prior.inpaint(scenes, mask, num_steps=3)
     untouched = ~mask.any(dim=-1)
     assert torch.equal(changed.tensor[untouched], scenes.tensor[untouched])
     for batch in (fuller, moved, changed):

@@ -139,7 +139,7 @@ def test_kept_entries_come_back_bit_identical(prior: MixedPrior, scenes: SceneBa
     full = prior.complete(scenes, slots=40, num_steps=4)
     present = ~scenes.is_empty
     assert (full.tensor[:, :34][present] == scenes.tensor[present]).all()
-    both = prior.inpaint(scenes[:2], mask[:2], num_steps=4, seed=3, resample=2)
+    both = prior.inpaint(scenes[:2], mask[:2], num_steps=4, seed=3)
     assert (both.tensor[:, 9:] == scenes.tensor[:2, 9:]).all()
 
 
@@ -193,8 +193,6 @@ def test_whatever_is_regenerated_objects_keep_valid_poses(process: str, scenes: 
 def test_bad_masks_and_names_are_refused(prior: MixedPrior, scenes: SceneBatch) -> None:
     with pytest.raises(InvalidInputError, match=r"\(6, 34, 2\)"):
         prior.inpaint(scenes, torch.zeros(6, 34, 3, dtype=torch.bool))
-    with pytest.raises(InvalidInputError, match="resample=0"):
-        prior.inpaint(scenes, torch.zeros(6, 34, dtype=torch.bool), resample=0)
     with pytest.raises(UnknownNameError, match="did you mean 'mixed'"):
         tiny_prior(process="mixd")
     with pytest.raises(InvalidInputError, match="num_steps=1001"):

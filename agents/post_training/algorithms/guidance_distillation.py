@@ -12,7 +12,7 @@ from agents.post_training.algorithms.base import AveragedSampler, BatchGradient,
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import text_of
 from agents.post_training.settings import GuidanceDistillationSettings
-from agents.priors.guidance import PhysicsGuidance, position_std
+from agents.priors.guidance import PhysicsGuidance
 from agents.priors.prior import NoisedScenes, ScenePrior
 from agents.utils.process_group import ProcessGroup
 from scene_envs.errors import InvalidInputError
@@ -115,13 +115,13 @@ class GuidanceDistillation(AveragedSampler):
         self.loss = GuidanceDistillationLoss(self.prior)
         self._teacher = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, independent=False)
         table: Any = policy.table
-        self._stds = [position_std(self.sampler, step, table) for step in range(len(policy))]
+        self._stds = [self.sampler.position_std(step, table) for step in range(len(policy))]
         self.steps = [step for step, std in enumerate(self._stds) if PhysicsGuidance.acts(std)]
         if not self.steps:
             error = 1e3 * float(self._stds[-1][:2].max())
             raise InvalidInputError(
                 f"algorithm={settings.name} has nothing to learn: physics guidance acts once horizontal positions are "
-                f"known to 3 cm, and the error of this prior is {error:.0f} mm at the last of num_steps={len(policy)} "
+                f"known to 2 cm, and the error of this prior is {error:.0f} mm at the last of num_steps={len(policy)} "
                 "steps; pretrain the prior for longer"
             )
 
