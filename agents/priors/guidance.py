@@ -62,14 +62,14 @@ watch has a method ``see(step, steps, x)``, the method is called with x_t (B, N,
 # -- physics --------------------------------------------------------------------------------------
 
 
-_FINE = 0.02
+_FINE = 0.03
 """Error (m) of horizontal positions below which objects are moved; above it, overlaps are not known yet."""
 
 
 class PhysicsGuidance:
     """Moves the objects of each scene out of overlaps and onto supports, at the last steps of the denoising.
 
-    From the step on at which the horizontal error of the denoised positions is below 2 cm, objects that overlap in the
+    From the step on at which the horizontal error of the denoised positions is below 3 cm, objects that overlap in the
     denoised scene come apart, and floating ones come down, by ``strength`` times the moves of
     :func:`~scene_envs.physics.correction.corrections`. The following steps adapt the scene to the moves. At the last
     step the moves change the sample itself.

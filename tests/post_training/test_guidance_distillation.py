@@ -122,7 +122,7 @@ def test_the_prior_comes_nearer_to_guided_samples(trainer: PostTrainer) -> None:
 def test_a_prior_that_knows_no_position_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     prior = tiny_prior()
     monkeypatch.setattr(type(prior), "estimate", lambda *_: (0.5, torch.full((3,), 0.5)))
-    with pytest.raises(InvalidInputError, match=r"known to 2 cm.*num_steps=12"):
+    with pytest.raises(InvalidInputError, match=r"known to 3 cm.*num_steps=12"):
         PostTrainer(small_config(tmp_path, num_steps=STEPS, algorithm={"name": NAME}), prior=prior)
 
 
@@ -138,5 +138,5 @@ def test_steps_are_those_at_which_the_guidance_acts(trainer: PostTrainer) -> Non
         float(learner.sampler.position_std(step, trainer.learner.policy.table)[:2].max())  # type: ignore[arg-type]
         for step in range(STEPS)
     ]
-    assert learner.steps == np.flatnonzero(np.array(stds) <= 0.02).tolist()
+    assert learner.steps == np.flatnonzero(np.array(stds) <= 0.03).tolist()
     assert 0 < len(learner.steps) < STEPS

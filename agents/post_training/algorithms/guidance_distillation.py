@@ -121,7 +121,7 @@ class GuidanceDistillation(AveragedSampler):
             error = 1e3 * float(self._stds[-1][:2].max())
             raise InvalidInputError(
                 f"algorithm={settings.name} has nothing to learn: physics guidance acts once horizontal positions are "
-                f"known to 2 cm, and the error of this prior is {error:.0f} mm at the last of num_steps={len(policy)} "
+                f"known to 3 cm, and the error of this prior is {error:.0f} mm at the last of num_steps={len(policy)} "
                 "steps; pretrain the prior for longer"
             )
 
