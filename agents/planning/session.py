@@ -22,11 +22,11 @@ import torch
 
 from agents.planning.ledger import PlanResult, Progress, Searchable, SearchStoppedError, state_value
 from agents.utils.interrupts import Terminated, terminable
-from scene_envs.envs import MaskChoiceState, SearchState
+from scene_envs.envs import SearchState
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.scene import SceneBatch
 
-_MAGIC = b"scene-envs search 1\n"
+_MAGIC = b"scene-envs search 2\n"
 _HEAD = struct.Struct("<II")
 """Length and CRC-32 of a record."""
 
@@ -56,7 +56,7 @@ class Journal:
                 raise InvalidInputError(
                     f"{self.path} holds a search with {name}={before}, not {now}; give another output, or that value"
                 )
-        self._states = [_state(values) for states in records[1:] for values in states]
+        self._states = [SearchState(**values) for states in records[1:] for values in states]
 
     def __len__(self) -> int:
         """Number of states that an earlier run wrote."""
@@ -86,7 +86,7 @@ class Journal:
         """All states in the file, in order, with one round in memory at a time."""
         with self.path.open("rb") as file:
             for record in islice(self._records(file), 1, None):
-                yield from map(_state, record)
+                yield from (SearchState(**values) for values in record)
 
     def _append(self, content: Any) -> None:
         buffer = io.BytesIO()
@@ -121,10 +121,6 @@ class Journal:
                 start = file.tell() - length - _HEAD.size
                 raise CorruptFileError(f"{self.path} is damaged at byte {start}; remove it, or give another output")
             yield torch.load(io.BytesIO(record), weights_only=True)
-
-
-def _state(values: Mapping[str, Any]) -> SearchState:
-    return MaskChoiceState(**values) if "masks" in values else SearchState(**values)
 
 
 def _described(value: Any) -> str:
