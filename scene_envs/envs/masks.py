@@ -5,14 +5,14 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from scene_envs.envs.scoring import Score, resolve_reward
-from scene_envs.errors import Checked, InvalidInputError, Natural, SceneEnvsError, unknown_name
+from scene_envs.errors import Checked, InvalidInputError, Limit, SceneEnvsError, unknown_name
 from scene_envs.registry import Registry, load_plugin
 from scene_envs.scene import SceneBatch
 
@@ -65,11 +65,14 @@ def random_mask(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Te
     return mask
 
 
+_SOME = Limit(lambda number: type(number) is int and number >= 0, "must be a whole number of at least 0")
+
+
 @dataclass(frozen=True)
 class EmptyMask(Checked):
     """Empty slots, and no object: ``count`` of them at random, or all with None."""
 
-    count: Natural | None = None
+    count: Annotated[int, _SOME] | None = None
 
     place = "mask=empty: "
 
@@ -130,7 +133,7 @@ class CulpritsMask(Checked):
     by clamping therefore adds too many objects and spoils the observed ones.
     """
 
-    at_least: Natural = 4
+    at_least: Annotated[int, _SOME] = 4
 
     @property
     def place(self) -> str:  # type: ignore[override]
