@@ -133,12 +133,13 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         self.render_mode = check_render_mode(render_mode, _RENDER_MODES)
         self._viewer: LiveViewer | None = None  # the page of "human", made at the first reset
         self.problem = problem = SearchProblem(**settings)
+        self._chooses = "masks" in settings
         choice = spaces.Box(0, 1, (len(problem.mask_names), problem.slots), np.int8)
         self.observation_space = spaces.Dict(
             {
                 "scene": scene_box(STATE_BOUND, problem.slots, problem.scene_type.features),
                 "object_mask": spaces.MultiBinary(problem.slots),
-                "regenerate": choice if "masks" in settings else spaces.MultiBinary(problem.slots),
+                "regenerate": choice if self._chooses else spaces.MultiBinary(problem.slots),
                 "depth": spaces.Box(0, problem.max_depth, (1,), np.int64),
                 "value": spaces.Box(0.0, 1.0, (1,), np.float32),
             }
@@ -333,7 +334,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         observation = {
             "scene": normalised.numpy(),
             "object_mask": present,
-            "regenerate": state.masks.numpy().astype(np.int8).reshape(self.observation_space["regenerate"].shape),
+            "regenerate": (state.masks if self._chooses else state.mask).numpy().astype(np.int8),
             "depth": np.array([state.depth], np.int64),
             "value": np.array([state.value], np.float32),
         }
