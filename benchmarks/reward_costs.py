@@ -23,7 +23,7 @@ from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 
 SIZES = {20: ("dimsum_table", 19, 22), 60: ("pantry_shelf", 57, 61)}
-COMPOSITES = ("clip", "gate", "product", "weighted_sum")
+COMPOSITES = ("clip", "product", "weighted_sum")
 PROMPT = "A scene where a cup is on top of the first plate from the left and the teapot is behind the cup."
 SHELF_PROMPT = "A scene where three apples are on the top shelf and two pears are on the bottom shelf."
 

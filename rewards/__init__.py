@@ -9,16 +9,13 @@ from rewards.base import (
     Reward,
     RewardContext,
     RewardOutput,
-    averages_objects,
-    counts_objects,
-    depends_on_batch,
+    facts_of,
     learned_parts,
-    needs_prompts,
 )
 from rewards.check import check_reward
 from rewards.clearance import Clearance
 from rewards.clutter import Clutter
-from rewards.composite import Clip, Gate, Product, WeightedSum
+from rewards.composite import Clip, Product, WeightedSum
 from rewards.counts import CategoryCount, ObjectCount
 from rewards.diversity import Diversity
 from rewards.evaluation import evaluate_reward
@@ -49,7 +46,6 @@ __all__ = [
     "Diversity",
     "FeasibleObjects",
     "FeasibleShare",
-    "Gate",
     "IsolatedReward",
     "LearnedReward",
     "ObjectCount",
@@ -66,15 +62,12 @@ __all__ = [
     "WeightedSum",
     "allow_local_rewards",
     "allow_reward_targets",
-    "averages_objects",
     "check_reward",
-    "counts_objects",
-    "depends_on_batch",
     "evaluate_reward",
+    "facts_of",
     "learned_parts",
     "list_rewards",
     "make_reward",
-    "needs_prompts",
     "register_reward",
     "resolve_reward",
     "reward_info",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -62,61 +62,35 @@ class RewardOutput:
 class Reward(Protocol):
     """Anything callable as ``(SceneBatch, RewardContext) -> RewardOutput``.
 
-    A scene scores the same alone and in any batch, unless the reward says otherwise by an attribute
-    ``depends_on_batch`` that is True (see :func:`depends_on_batch`). A reward may declare its largest value by an
-    attribute ``maximum`` (see :func:`declared_maximum`), which searches take for their scale. A reward that is a mean
-    over the objects and gives credit per object says so by ``averages_objects = True`` (see :func:`averages_objects`).
-    A reward that counts objects says so by ``counts_objects = True`` (see :func:`counts_objects`). A reward that reads
-    the prompts of its context says so by ``needs_prompts = True``: runs without prompts then refuse it at their start.
+    A scene scores the same alone and in any batch, unless the reward says otherwise. A reward may declare its largest
+    value by an attribute ``maximum`` (see :func:`declared_maximum`), which searches take for their scale. Attributes
+    that are True describe it (see :func:`facts_of`):
+
+    - ``depends_on_batch``: the score of a scene depends on the other scenes of its batch;
+    - ``averages_objects``: the score is a mean over the objects, not a sum. In a sum, an empty slot has credit 0. A
+      mean is taken over the objects alone, so an empty slot has no credit;
+    - ``counts_objects``: the score depends on which objects a scene has. Their credit does not depend on their poses,
+      so algorithms with credit per object give the advantage of the scene to the categories;
+    - ``needs_prompts``: the reward compares scenes with the prompts of its context; runs without prompts refuse it at
+      their start.
     """
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput: ...
 
 
-def depends_on_batch(*rewards: object) -> bool:
-    """Whether the score of a scene under one of ``rewards`` depends on the other scenes of its batch.
+_FACTS: dict[str, Callable[[Iterable[bool]], bool]] = {
+    "depends_on_batch": any, "averages_objects": all, "counts_objects": any, "needs_prompts": any,
+}  # fmt: skip
 
-    >>> depends_on_batch(lambda batch: batch.counts)
+
+def facts_of(*rewards: object) -> dict[str, bool]:
+    """The attributes by which a :class:`Reward` describes itself, False where it has none. Of several rewards, such as
+    the parts of a sum, ``averages_objects`` says whether all are means, and the others whether one of them is so.
+
+    >>> facts_of(lambda batch: batch.counts)["depends_on_batch"]
     False
     """
-    return any(bool(getattr(reward, "depends_on_batch", False)) for reward in rewards)
-
-
-def averages_objects(*rewards: object) -> bool:
-    """Whether each of ``rewards`` is a mean over the objects of a scene, not a sum.
-
-    In a sum, an empty slot has credit 0. A mean is taken over the objects alone, so an empty slot has no credit.
-
-    >>> averages_objects(lambda batch: batch.counts)
-    False
-    """
-    return all(bool(getattr(reward, "averages_objects", False)) for reward in rewards)
-
-
-def counts_objects(*rewards: object) -> bool:
-    """Whether one of ``rewards`` depends on which objects a scene has, and not on their poses.
-
-    The credit of such objects does not depend on their poses. Algorithms with credit per object therefore give the
-    advantage of the scene to the categories.
-
-    >>> counts_objects(lambda batch: batch.counts)
-    False
-    """
-    return any(bool(getattr(reward, "counts_objects", False)) for reward in rewards)
-
-
-def needs_prompts(*rewards: object) -> bool:
-    """Whether one of ``rewards`` compares scenes with the prompts for which they were made.
-
-    >>> needs_prompts(lambda batch: batch.counts)
-    False
-    """
-    return any(bool(getattr(reward, "needs_prompts", False)) for reward in rewards)
-
-
-def facts_of(reward: object) -> dict[str, bool]:
-    """The answers of ``depends_on_batch``, ``averages_objects``, ``counts_objects`` and ``needs_prompts``, by name."""
-    return {fact.__name__: fact(reward) for fact in (depends_on_batch, averages_objects, counts_objects, needs_prompts)}
+    return {name: of(bool(getattr(reward, name, False)) for reward in rewards) for name, of in _FACTS.items()}
 
 
 def declared_maximum(reward: object, slots: int, free_slots: int) -> float | None:
@@ -167,10 +141,5 @@ def learned_parts(reward: Any) -> list[LearnedReward]:
     """
     if isinstance(reward, LearnedReward):
         return [reward]
-    return [found for part in parts_of(reward) for found in learned_parts(part)]
-
-
-def parts_of(reward: Any) -> list[Any]:
-    """The parts of a composite, in a fixed order; none of any other reward."""
-    parts = [getattr(reward, name) for name in ("reward", "condition") if hasattr(reward, name)]
-    return [*parts, *getattr(reward, "rewards", ())]
+    parts = [*([reward.reward] if hasattr(reward, "reward") else []), *getattr(reward, "rewards", ())]
+    return [found for part in parts for found in learned_parts(part)]

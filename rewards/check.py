@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, partial
+from itertools import count
 from typing import Any
 
 import torch
 from torch import Generator, Tensor
 
-from rewards.base import RewardContext, RewardOutput, depends_on_batch
+from rewards.base import RewardContext, RewardOutput, facts_of
 from rewards.evaluation import evaluate_reward, other_draw
 from rewards.feasible import forget_verdicts
 from rewards.registry import resolve_reward, reward_name
@@ -21,7 +22,7 @@ from scene_envs.scene_types import SceneType, get_scene_type
 TOLERANCE = 1e-4
 """Largest difference, relative to max(1, |value|), of values that the contract requires to be equal."""
 
-Check = Callable[["_Subject"], None]
+_ALONE = "scores a scene the same alone and in a batch"
 
 
 def check_reward(
@@ -42,48 +43,58 @@ def check_reward(
     >>> check_reward("object_count")[0]
     'scores scenes that hold nothing but welded objects'
     """
-    subject = _Subject(resolve_reward(reward), get_scene_type(scene_type), context, seed)
-    checks = dict(_CHECKS)
-    if depends_on_batch(subject.reward):
+    resolved, kind, generator = resolve_reward(reward), get_scene_type(scene_type), Generator().manual_seed(seed)
+    scenes, calls = random_scenes(kind, 4, generator), count(1)
+    slots = scenes.tensor.shape[1]
+    order = torch.randperm(slots, generator=generator)
+
+    def score(batch: SceneBatch) -> RewardOutput:
+        forget_verdicts()  # each call must simulate anew
+        prompts = tuple(f"A scene with {n} object{'s' * (n != 1)}." for n in batch.counts.tolist())
+        with other_draw(next(calls)):  # a reward that draws random numbers then gives another score
+            return evaluate_reward(resolved, batch, context or RewardContext(prompts=prompts), strict=True)
+
+    expected = cache(partial(score, scenes))
+
+    def compare(what: str, batch: SceneBatch, rows: Any = slice(None), columns: Any = slice(None)) -> None:
+        """The scores of ``batch`` must be those of some of the scenes, with their slots in another order."""
+        _require_equal(_part(expected(), rows, columns), _part(score(batch), slice(None), slice(slots)), what)
+
+    def compare_alone() -> None:
+        for row in (0, len(scenes) - 1):
+            compare(f"scene {row} scored alone", scenes[row], [row])
+
+    shuffled = SceneBatch(scenes.tensor[:, order], kind)
+    checks: dict[str, Callable[[], None]] = {
+        "scores scenes that hold nothing but welded objects": lambda: _require_some_valid(
+            score(SceneBatch.empty(kind, 2)), "scenes without free objects"
+        ),
+        "scores crowded scenes with overlapping objects": lambda: _require_some_valid(
+            expected(), "scenes of strewn, overlapping objects"
+        ),
+        "gives the same scores when called again": lambda: compare("a second call on the same scenes", scenes),
+        _ALONE: compare_alone,
+        "does not depend on the order of the slots": lambda: compare(
+            "the same scenes with their slots shuffled", shuffled, columns=order
+        ),
+        "does not depend on the number of empty slots": lambda: compare(
+            "the same scenes with 3 more empty slots", scenes.with_slots(slots + 3)
+        ),
+    }
+    if facts_of(resolved)["depends_on_batch"]:
         del checks[_ALONE]
     failures: list[str] = []
     for title, check in checks.items():
         try:
-            check(subject)
+            check()
         except RewardError as error:
             failures.append(f"  {title}: no. {error}")
             if isinstance(error, RewardTimeoutError):
                 break
     if failures:
-        name = reward_name(subject.reward)
+        name = reward_name(resolved)
         raise RewardError(f"reward {name!r} breaks {len(failures)} of {len(checks)} clauses:\n" + "\n".join(failures))
     return list(checks)
-
-
-class _Subject:
-    """The reward under test and its test scenes."""
-
-    def __init__(self, reward: Any, scene_type: SceneType, context: RewardContext | None, seed: int) -> None:
-        self.reward = reward
-        self.given_context = context
-        self.generator = Generator().manual_seed(seed)
-        self.empty = SceneBatch.empty(scene_type, 2)
-        self.random = random_scenes(scene_type, 4, self.generator)
-        self._calls = 0
-
-    def score(self, batch: SceneBatch) -> RewardOutput:
-        self._calls += 1
-        forget_verdicts()  # each call must simulate anew
-        context = self.given_context
-        if context is None:
-            counts = batch.counts.tolist()
-            context = RewardContext(prompts=tuple(f"A scene with {n} object{'s' * (n != 1)}." for n in counts))
-        with other_draw(self._calls):  # a reward that draws random numbers then gives another score
-            return evaluate_reward(self.reward, batch, context, strict=True)
-
-    @cached_property
-    def random_output(self) -> RewardOutput:
-        return self.score(self.random)
 
 
 def random_scenes(scene_type: SceneType, count: int, generator: Generator) -> SceneBatch:
@@ -103,50 +114,11 @@ def random_scenes(scene_type: SceneType, count: int, generator: Generator) -> Sc
     return SceneBatch.from_parts(translations, rotations, categories, scene_type)
 
 
-def _rows_are_independent(subject: _Subject) -> None:
-    for row in (0, len(subject.random) - 1):
-        alone = subject.score(subject.random[row])
-        _require_equal(_rows(subject.random_output, [row]), alone, f"scene {row} scored alone")
-
-
-def _ignores_slot_order(subject: _Subject) -> None:
-    order = torch.randperm(subject.random.tensor.shape[1], generator=subject.generator)
-    shuffled = SceneBatch(subject.random.tensor[:, order], subject.random.scene_type)
-    output = subject.random_output
-    expected = RewardOutput(
-        output.value, None if output.per_object is None else output.per_object[:, order], valid=output.valid
-    )
-    _require_equal(expected, subject.score(shuffled), "the same scenes with their slots shuffled")
-
-
-def _ignores_empty_slots(subject: _Subject) -> None:
-    slots = subject.random.tensor.shape[1]
-    larger = subject.score(subject.random.with_slots(slots + 3))
-    credit = None if larger.per_object is None else larger.per_object[:, :slots]
-    larger = RewardOutput(larger.value, credit, valid=larger.valid)
-    _require_equal(subject.random_output, larger, "the same scenes with 3 more empty slots")
-
-
-_ALONE = "scores a scene the same alone and in a batch"
-_CHECKS: dict[str, Check] = {
-    "scores scenes that hold nothing but welded objects": lambda subject: _require_some_valid(
-        subject.score(subject.empty), "scenes without free objects"
-    ),
-    "scores crowded scenes with overlapping objects": lambda subject: _require_some_valid(
-        subject.random_output, "scenes of strewn, overlapping objects"
-    ),
-    "gives the same scores when called again": lambda subject: _require_equal(
-        subject.random_output, subject.score(subject.random), "a second call on the same scenes"
-    ),
-    _ALONE: _rows_are_independent,
-    "does not depend on the order of the slots": _ignores_slot_order,
-    "does not depend on the number of empty slots": _ignores_empty_slots,
-}
-
-
-def _rows(output: RewardOutput, rows: list[int]) -> RewardOutput:
+def _part(output: RewardOutput, rows: Any, columns: Any) -> RewardOutput:
     credit = output.per_object
-    return RewardOutput(output.value[rows], None if credit is None else credit[rows], valid=output.is_valid[rows])
+    return RewardOutput(
+        output.value[rows], None if credit is None else credit[rows][:, columns], valid=output.is_valid[rows]
+    )
 
 
 def _require_some_valid(output: RewardOutput, what: str) -> None:

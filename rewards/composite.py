@@ -1,4 +1,4 @@
-"""Composite rewards: weighted sum, product, gate, clip.
+"""Composite rewards: weighted sum, product, clip.
 
 Every part may be a name, a mapping, a function or a reward. A scene is valid when every part could score it.
 A composite depends on the batch if a part does. A part's value is a term under the part's name, and its own
@@ -18,12 +18,8 @@ from rewards.base import (
     Reward,
     RewardContext,
     RewardOutput,
-    averages_objects,
-    counts_objects,
     declared_maximum,
-    depends_on_batch,
     facts_of,
-    needs_prompts,
 )
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
@@ -57,10 +53,8 @@ class WeightedSum:
         if len(self.weights) != len(self.rewards):
             raise InvalidInputError(f"weighted_sum: {len(self.rewards)} rewards need as many weights, got {weights!r}")
         self.offset = float(offset)
-        self.depends_on_batch = depends_on_batch(*self.rewards)
-        self.averages_objects = averages_objects(*self.rewards)
-        self.counts_objects = counts_objects(*self.rewards)
-        self.needs_prompts = needs_prompts(*self.rewards)
+        self.facts = facts_of(*self.rewards)
+        vars(self).update(self.facts)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         outputs = _score_parts(self.rewards, batch, context)
@@ -77,7 +71,7 @@ class WeightedSum:
     def _credit(self, reward: Reward, output: RewardOutput, batch: SceneBatch) -> Tensor:
         """(B, N) credits of a part; in a sum of means and other rewards, those of a mean are shares of its value."""
         assert output.per_object is not None
-        if self.averages_objects or not averages_objects(reward):
+        if self.facts["averages_objects"] or not facts_of(reward)["averages_objects"]:
             return output.per_object
         judged = output.object_flags.get("judged", batch.is_free)
         return output.per_object / judged.sum(dim=1, keepdim=True).clamp(min=1)
@@ -101,7 +95,7 @@ class Product:
 
     def __init__(self, rewards: Sequence[Any]) -> None:
         self.rewards = _resolve_parts(self.name, rewards)
-        self.depends_on_batch = depends_on_batch(*self.rewards)
+        vars(self).update(facts_of(*self.rewards), averages_objects=False, counts_objects=False)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         outputs = _score_parts(self.rewards, batch, context)
@@ -109,44 +103,6 @@ class Product:
 
     def __repr__(self) -> str:
         return f"Product({list(self.rewards)})"
-
-
-@register_reward("gate")
-@dataclass(frozen=True)
-class Gate:
-    """A reward that counts only where another one reaches a threshold.
-
-    Attributes:
-        reward: reward to compute.
-        condition: reward that opens the gate.
-        threshold: smallest value of ``condition`` at which the gate is open.
-        otherwise: value of scenes with a closed gate.
-
-    >>> gate = Gate("object_count", condition="object_count", threshold=2.0, otherwise=-1.0)
-    >>> gate(SceneBatch.empty("dimsum_table", 1), RewardContext()).value
-    tensor([-1.])
-    """
-
-    name: ClassVar[str] = "gate"
-    reward: Any
-    condition: Any
-    threshold: float
-    otherwise: float = 0.0
-
-    def __post_init__(self) -> None:
-        parts = {"reward": resolve_reward(self.reward), "condition": resolve_reward(self.condition)}
-        vars(self).update(parts, **facts_of(parts["reward"]))
-        vars(self)["depends_on_batch"] = depends_on_batch(*parts.values())
-        vars(self)["needs_prompts"] = needs_prompts(*parts.values())
-
-    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """Score both; credit per object is that of ``reward`` where the gate is open, else 0."""
-        outputs = _score_parts((self.reward, self.condition), batch, context)
-        scored, condition = outputs.values()
-        is_open = condition.value >= self.threshold
-        value = torch.where(is_open, scored.value, torch.full_like(scored.value, self.otherwise))
-        credit = None if scored.per_object is None else scored.per_object * is_open.unsqueeze(-1)
-        return _combine(value, outputs, credit, {"gate_open": is_open.float()})
 
 
 @register_reward("clip")
@@ -209,12 +165,7 @@ def _score_parts(parts: Sequence[Reward], batch: SceneBatch, context: RewardCont
     return outputs
 
 
-def _combine(
-    value: Tensor,
-    outputs: Mapping[str, RewardOutput],
-    per_object: Tensor | None = None,
-    own_terms: Mapping[str, Tensor] | None = None,
-) -> RewardOutput:
+def _combine(value: Tensor, outputs: Mapping[str, RewardOutput], per_object: Tensor | None = None) -> RewardOutput:
     terms: dict[str, Tensor] = {}
     flags: dict[str, Tensor] = {}
     for label, output in outputs.items():
@@ -222,6 +173,5 @@ def _combine(
         terms.update({f"{label}.{name}": term for name, term in output.terms.items()})
         for name, flag in output.object_flags.items():
             flags[name if name not in flags else f"{label}.{name}"] = flag
-    terms.update(own_terms or {})
     valid = torch.stack([output.is_valid for output in outputs.values()]).all(dim=0)
     return RewardOutput(value, per_object, terms, valid, flags)

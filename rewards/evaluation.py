@@ -7,9 +7,9 @@ import linecache
 import logging
 import os
 import random
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -28,7 +28,8 @@ from scene_envs.scene import SceneBatch
 
 logger = logging.getLogger(__name__)
 
-_local = threading.local()
+DRAW: ContextVar[int] = ContextVar("draw", default=0)
+"""Number of the stream of random numbers from which rewards draw."""
 _warned: set[tuple[int, str]] = set()
 _MAX_WARNINGS = 256
 
@@ -37,14 +38,14 @@ _MAX_WARNINGS = 256
 def seeded_generators(seed: int, batch: SceneBatch | None = None) -> Iterator[None]:
     """Context in which the generators of torch (CPU), NumPy and Python have a seed that depends on the scenes.
 
-    The seed depends only on ``seed``, the scenes (None while the reward is made) and :func:`current_draw`, so the same
+    The seed depends only on ``seed``, the scenes (None while the reward is made) and :data:`DRAW`, so the same
     scenes get the same numbers in every call and process, and after a run is resumed. Earlier states come back
     afterwards.
     """
     states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     scenes = b"" if batch is None else batch.tensor.detach().cpu().contiguous().numpy().tobytes()
     digest = hashlib.blake2b(scenes, digest_size=8)
-    digest.update(f"{seed} {current_draw()}".encode())
+    digest.update(f"{seed} {DRAW.get()}".encode())
     number = int.from_bytes(digest.digest(), "little")
     torch.default_generator.manual_seed(number >> 1)
     np.random.seed(number % 2**32)  # noqa: NPY002
@@ -60,17 +61,11 @@ def seeded_generators(seed: int, batch: SceneBatch | None = None) -> Iterator[No
 @contextmanager
 def other_draw(number: int) -> Iterator[None]:
     """Context in which rewards draw from the stream ``number`` of random numbers; the default stream is 0."""
-    before = current_draw()
-    _local.draw = number
+    token = DRAW.set(number)
     try:
         yield
     finally:
-        _local.draw = before
-
-
-def current_draw() -> int:
-    """Number of the stream of random numbers of this thread's rewards."""
-    return int(getattr(_local, "draw", 0))
+        DRAW.reset(token)
 
 
 def evaluate_reward(
@@ -122,7 +117,9 @@ def reward_scorer(reward: Any) -> SceneScorer:
 
 def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardOutput:
     name = reward_name(reward)
-    version = batch.tensor._version
+    version = (
+        None if batch.tensor.is_inference() else batch.tensor._version
+    )  # tensors of inference mode count no changes
     own, process = is_own(reward), os.getpid()
     given = batch if own else SceneBatch(batch.tensor.clone(), batch.scene_type)  # foreign code gets a copy
     try:
@@ -141,7 +138,8 @@ def _evaluate(reward: Any, batch: SceneBatch, context: RewardContext) -> RewardO
     finally:
         if os.getpid() != process:  # the reward forked this copy of the process, which must not continue the run
             os._exit(0)
-    if batch.tensor._version != version or not (own or torch.equal(given.tensor, batch.tensor)):
+    changed = version is not None and batch.tensor._version != version
+    if changed or not (own or torch.equal(given.tensor, batch.tensor)):
         raise RewardError(f"reward {name!r} changed the scenes it was given; work on a clone of batch.tensor")
     return _checked(name, output, batch)
 
@@ -163,50 +161,41 @@ def _checked(name: str, output: Any, batch: SceneBatch) -> RewardOutput:
         raise RewardError(
             f"reward {name!r} returned {type(output).__name__}; return a (B,) tensor or a rewards.RewardOutput"
         )
-    scenes, slots = batch.tensor.shape[:2]
-    device = batch.tensor.device
-    rows, grid = (scenes,), (scenes, slots)
-    value = _floats(name, "value", output.value, rows, device)
-    credit = output.per_object
-    terms = _named(name, "terms", output.terms)
-    flags = _named(name, "object_flags", output.object_flags)
+    rows, grid = batch.counts, batch.is_empty
+    value, credit = _tensor(name, "value", output.value, rows), output.per_object
+    terms, flags = _named(name, "terms", output.terms), _named(name, "object_flags", output.object_flags)
     valid = torch.isfinite(value)
     if output.valid is not None:
-        valid = valid & _bools(name, "valid", output.valid, rows, device)
+        valid = valid & _tensor(name, "valid", output.valid, rows, is_bool=True)
     return RewardOutput(
         value,
-        None if credit is None else _floats(name, "per_object", credit, grid, device),
-        {key: _floats(name, f"terms[{key!r}]", term, rows, device) for key, term in terms.items()},
+        None if credit is None else _tensor(name, "per_object", credit, grid),
+        {key: _tensor(name, f"terms[{key!r}]", term, rows) for key, term in terms.items()},
         valid,
-        {key: _bools(name, f"object_flags[{key!r}]", flag, grid, device) for key, flag in flags.items()},
+        {key: _tensor(name, f"object_flags[{key!r}]", flag, grid, is_bool=True) for key, flag in flags.items()},
         output.problem,
     )
 
 
-def _floats(name: str, field: str, tensor: Any, shape: tuple[int, ...], device: torch.device) -> Tensor:
-    _check_tensor(name, field, tensor, shape, device)
-    if not tensor.is_floating_point():
-        raise RewardError(f"reward {name!r}: {field} has dtype {tensor.dtype}, expected a float; use .float()")
-    return tensor.detach().to(torch.float32)  # type: ignore[no-any-return]
-
-
-def _bools(name: str, field: str, tensor: Any, shape: tuple[int, ...], device: torch.device) -> Tensor:
-    _check_tensor(name, field, tensor, shape, device)
-    if tensor.dtype != torch.bool:
-        raise RewardError(f"reward {name!r}: {field} has dtype {tensor.dtype}, expected torch.bool")
-    return tensor  # type: ignore[no-any-return]
-
-
-def _check_tensor(name: str, field: str, tensor: Any, shape: tuple[int, ...], device: torch.device) -> None:
+def _tensor(name: str, field: str, tensor: Any, like: Tensor, *, is_bool: bool = False) -> Tensor:
+    """``tensor`` as float32 or bool; raises RewardError if it is of another kind, or has not the shape and device of
+    ``like``.
+    """
+    place, shape = f"reward {name!r}: {field}", tuple(like.shape)
     if not isinstance(tensor, Tensor):
-        raise RewardError(f"reward {name!r}: {field} is a {type(tensor).__name__}, expected a torch.Tensor")
+        raise RewardError(f"{place} is a {type(tensor).__name__}, expected a torch.Tensor")
     if tuple(tensor.shape) != shape:
         meaning = "(B,) = one number per scene" if len(shape) == 1 else "(B, N) = one entry per slot"
-        raise RewardError(f"reward {name!r}: {field} has shape {tuple(tensor.shape)}, expected {shape}, {meaning}")
+        raise RewardError(f"{place} has shape {tuple(tensor.shape)}, expected {shape}, {meaning}")
     if tensor.layout != torch.strided:
-        raise RewardError(f"reward {name!r}: {field} is {tensor.layout}; use .to_dense()")
-    if tensor.device != device:
-        raise RewardError(f"reward {name!r}: {field} is on {tensor.device}, the scenes are on {device}")
+        raise RewardError(f"{place} is {tensor.layout}; use .to_dense()")
+    if tensor.device != like.device:
+        raise RewardError(f"{place} is on {tensor.device}, the scenes are on {like.device}")
+    if is_bool and tensor.dtype != torch.bool:
+        raise RewardError(f"{place} has dtype {tensor.dtype}, expected torch.bool")
+    if not is_bool and not tensor.is_floating_point():
+        raise RewardError(f"{place} has dtype {tensor.dtype}, expected a float; use .float()")
+    return tensor if is_bool else tensor.detach().to(torch.float32)
 
 
 def _named(name: str, field: str, tensors: Any) -> Mapping[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from rewards.base import RewardContext, RewardOutput, declared_maximum, facts_of, learned_parts
-from rewards.evaluation import current_draw, evaluate_reward, other_draw, seeded_generators
+from rewards.evaluation import DRAW, evaluate_reward, other_draw, seeded_generators
 from rewards.registry import (
     RewardInfo,
     allow_local_rewards,
@@ -23,7 +23,6 @@ from rewards.registry import (
     is_local,
     is_own,
     local_files,
-    names_in,
     plugin_module,
     registered_module,
     resolve_reward,
@@ -84,9 +83,12 @@ class IsolatedReward:
         InvalidInputError: ``reward`` is no valid reward, or a limit is no positive number.
         RewardError: the reward cannot be made, or not in time.
 
-    >>> with IsolatedReward("object_count", timeout=60.0) as reward:
+    >>> with IsolatedReward("object_count", timeout=60.0) as reward:  # doctest: +SKIP
     ...     reward(SceneBatch.empty("dimsum_table", 2), RewardContext()).value
     tensor([1., 1.])
+    >>> IsolatedReward(len)
+    Traceback (most recent call last):
+    scene_envs.errors.InvalidInputError: only a reward given by name or as a mapping can be isolated, got <built-in ...>
     """
 
     @takes(ProcessSettings)
@@ -112,14 +114,13 @@ class IsolatedReward:
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Score in the worker; the batch may be on any device."""
         scenes = batch.tensor.detach().cpu().contiguous().numpy()
-        facts = context.prompts, self.settings.seed if context.seed == 0 else context.seed, current_draw()
+        facts = context.prompts, self.settings.seed if context.seed == 0 else context.seed, DRAW.get()
         body = self._ask("score", replace(batch.scene_type), scenes, facts)
 
         def tensor(array: Any) -> Any:
-            return array if array is None else torch.from_numpy(np.array(array)).to(batch.tensor.device)
+            return torch.from_numpy(np.array(array)).to(batch.tensor.device)
 
-        terms, flags = ({name: tensor(part) for name, part in body[key].items()} for key in ("terms", "object_flags"))
-        return RewardOutput(tensor(body["value"]), tensor(body["per_object"]), terms, tensor(body["valid"]), flags)
+        return RewardOutput(**_each(tensor, np.ndarray, body))
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
@@ -228,7 +229,7 @@ class RewardRunner:
         return declared_maximum(self.reward, slots, free_slots)
 
     def score(self, scene_type: Any, scenes: Any, facts: tuple[Any, int, int]) -> dict[str, Any]:
-        """Score one batch; returns the output as arrays."""
+        """Score one batch; returns the fields of the output, as arrays."""
         prompts, seed, draw = facts
         try:
             known = get_scene_type(scene_type.name)
@@ -238,13 +239,15 @@ class RewardRunner:
         context = RewardContext(prompts=prompts, pool=self.pool, seed=seed)
         with other_draw(draw):
             output = evaluate_reward(self.reward, batch, context, strict=True)
-        return {
-            "value": output.value.cpu().numpy(),
-            "per_object": None if output.per_object is None else output.per_object.cpu().numpy(),
-            "terms": {name: term.cpu().numpy() for name, term in output.terms.items()},
-            "valid": output.is_valid.cpu().numpy(),
-            "object_flags": {name: flag.cpu().numpy() for name, flag in output.object_flags.items()},
-        }
+        fields: dict[str, Any] = _each(lambda tensor: tensor.cpu().numpy(), torch.Tensor, vars(output))
+        return fields
+
+
+def _each(change: Callable[[Any], Any], kind: type, part: Any) -> Any:
+    """``part`` with ``change`` applied to what is of this ``kind``, in mappings too."""
+    if isinstance(part, Mapping):
+        return {name: _each(change, kind, value) for name, value in part.items()}
+    return change(part) if isinstance(part, kind) else part
 
 
 class SeededReward:
@@ -313,19 +316,14 @@ def is_foreign(reward: Any) -> bool:
     >>> is_foreign("object_count"), is_foreign({"name": "clip", "reward": "./mine.py:clutter", "high": 1.0})
     (False, True)
     """
-    if isinstance(reward, Mapping) and "_target_" in reward and not str(reward["_target_"]).startswith("rewards."):
-        return True
+    if isinstance(reward, Mapping):
+        outside = not str(reward.get("_target_", "rewards.")).startswith("rewards.")
+        return outside or any(map(is_foreign, reward.values()))
     if not isinstance(reward, str):
-        return any(is_foreign(name) for name in _parts(reward))
+        return isinstance(reward, list | tuple) and any(map(is_foreign, reward))
     if is_local(reward):
         return True
     module = registered_module(reward) or plugin_module(reward)
     if module is None or module == "__main__" or module.split(".")[0] in ("rewards", "scene_envs", "agents"):
         return False
     return plugin_module(reward) is not None  # if not: registered by a module imported in this process alone
-
-
-def _parts(reward: Any) -> list[Any]:
-    if isinstance(reward, Mapping):
-        return [*names_in([reward.get("name", "")]), *(v for k, v in reward.items() if k != "name")]
-    return list(reward) if isinstance(reward, list | tuple) else []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint
@@ -44,7 +45,7 @@ class FunctionReward:
         self.settings = settings
         self.maximum = getattr(function, "maximum", None)
         vars(self).update(facts_of(function))
-        self._takes_context = _accepts(function, 2, settings, self.name)
+        self._takes_context = _takes_context(function, settings, self.name)
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         arguments = (batch, context) if self._takes_context else (batch,)
@@ -62,18 +63,16 @@ def as_output(result: Any) -> Any:
     return RewardOutput(result.to(torch.float32) if is_whole else result)
 
 
-def _accepts(function: Callable[..., Any], count: int, settings: Mapping[str, Any], name: str) -> bool:
-    """Whether ``function`` takes ``count`` positional arguments and ``settings``; if not, it must take one fewer."""
+def _takes_context(function: Callable[..., Any], settings: Mapping[str, Any], name: str) -> bool:
+    """Whether ``function`` takes (batch, context) and ``settings``, or else (batch); raises InvalidInputError."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
         return True
-    for number in (count, count - 1):
-        try:
-            signature.bind(*[None] * number, **settings)
-        except TypeError:
-            continue
-        return number == count
+    for arguments in ((None, None), (None,)):
+        with suppress(TypeError):
+            signature.bind(*arguments, **settings)
+            return len(arguments) == 2
     raise InvalidInputError(
         f"reward {name!r} has the signature {signature} and was given the settings {sorted(settings)}; "
         "it must take (batch) or (batch, context), and its settings as keywords"

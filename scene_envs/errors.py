@@ -158,4 +158,5 @@ def _conditions(kind: type) -> list[tuple[str, Limit | OneOf, bool]]:
         (name, condition, type(None) in get_args(hint))
         for name, hint, part in parts
         for condition in getattr(part, "__metadata__", ())
+        if isinstance(condition, Limit | OneOf)
     ]

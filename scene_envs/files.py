@@ -167,9 +167,6 @@ def finite(value: Any) -> Any:
 
 
 LOCK = ".writer.lock"
-_BEAT, _SILENCE = 15, 60
-"""Seconds between two signs of life of a writer, and seconds without a sign of life after which a writer on another
-computer counts as ended."""
 _PARTIAL = re.compile(r"\..*?\.(?P<process>\d+)(\.\w+)?\.partial")
 _held: set[Path] = set()
 _guard = threading.Lock()
@@ -208,8 +205,7 @@ def claimed(folder: str | os.PathLike[str], owner: str) -> Iterator[Path]:
             raise
         except OSError as error:
             raise storage_error(folder, error) from error
-        with _heartbeat(lock):
-            yield folder
+        yield folder
     finally:
         with _guard:
             _held.discard(key)
@@ -247,13 +243,6 @@ def _lock(path: Path, owner: str) -> int:
                     f"or give another output{takeover}"
                 ) from None
             raise
-        if (foreign := _owner_elsewhere(descriptor)) is not None:
-            os.close(descriptor)
-            raise InvalidInputError(
-                f"{str(path.parent)!r} is being written by {foreign}, whose last sign of life is less than "
-                f"{_SILENCE} s old; give another output, or, if that computer was switched off, wait a minute or "
-                f"remove {str(path)!r}"
-            )
         with suppress(FileNotFoundError):
             if os.fstat(descriptor).st_ino == os.stat(path).st_ino:  # it was not removed meanwhile
                 text = f"{owner}, process {os.getpid()} on {socket.gethostname()}, since {time.strftime('%F %T')}"
@@ -261,35 +250,6 @@ def _lock(path: Path, owner: str) -> int:
                 os.pwrite(descriptor, text.encode(), 0)
                 return descriptor
         os.close(descriptor)
-
-
-def _owner_elsewhere(descriptor: int) -> str | None:
-    """The owner of the lock if it is on another computer and gave a recent sign of life; else None. A file system may
-    share files between computers without their locks.
-    """
-    writer = os.pread(descriptor, 500, 0).decode(errors="replace").strip()
-    found = re.search(r"process \d+ on (.+), since", writer)
-    recent = time.time() - os.fstat(descriptor).st_mtime < _SILENCE
-    return writer if found is not None and found[1] != socket.gethostname() and recent else None
-
-
-@contextmanager
-def _heartbeat(descriptor: int) -> Iterator[None]:
-    """Context that sets the lock file's modification time to now every few seconds, as a sign of life."""
-    done = threading.Event()
-
-    def beat() -> None:
-        while not done.wait(_BEAT):
-            with suppress(OSError):
-                os.utime(descriptor)
-
-    thread = threading.Thread(target=beat, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
 
 
 def _is_alive(process: int) -> bool:

@@ -27,15 +27,11 @@ _LOGGER = logging.getLogger(__name__)
 
 
 def plugin_entry_points(group: str) -> dict[str, EntryPoint]:
-    """The entry points of ``group`` by name, of all installed packages. Those that the ``pyproject.toml`` of a checkout
-    declares replace installed ones, because the metadata of an editable install may be out of date or missing.
-    """
+    """The entry points of ``group`` by name, of all installed packages."""
     places = [(place, place or os.curdir) for place in sys.path]
-    installed = _installed_entry_points(
+    return _installed_entry_points(
         group, tuple((place, os.stat(path).st_mtime_ns) for place, path in places if os.path.exists(path))
     )
-    declared = _checkout_entry_points(Path(__file__).parents[1] / "pyproject.toml").get(group, {})
-    return installed | {name: EntryPoint(name, value, group) for name, value in declared.items()}
 
 
 @cache
@@ -44,18 +40,6 @@ def _installed_entry_points(group: str, places: tuple[tuple[str, int], ...]) -> 
     change are in ``places``, is another or gets a package.
     """
     return {point.name: point for point in entry_points(group=group)}
-
-
-@cache
-def _checkout_entry_points(pyproject: Path) -> dict[str, dict[str, str]]:
-    """The entry points of this project's own ``pyproject.toml``, by group; none where there is no such file."""
-    if sys.version_info < (3, 11) or not pyproject.is_file():  # Python 3.10 has no TOML reader: metadata alone
-        return {}
-    import tomllib
-
-    project = tomllib.loads(pyproject.read_text()).get("project", {})
-    groups: dict[str, dict[str, str]] = project.get("entry-points", {})
-    return groups if project.get("name") == "scene-envs" else {}
 
 
 @cache
@@ -306,20 +290,12 @@ def register_envs() -> None:
     """Register every SceneEnvs environment with Gymnasium (idempotent)."""
     if "SceneEnvs/Denoising-v0" in gymnasium.registry:
         return
+    adapters, search = "scene_envs.envs.denoising_adapters", "scene_envs.envs.search_gymnasium"
     gymnasium.register(
-        id="SceneEnvs/Denoising-v0",
-        entry_point="scene_envs.envs.denoising_adapters:DenoisingEnv",
-        vector_entry_point="scene_envs.envs.denoising_adapters:DenoisingVectorEnv",
-        disable_env_checker=True,
-        order_enforce=True,
-    )
-    gymnasium.register(
-        id="SceneEnvs/Search-v0",
-        entry_point="scene_envs.envs.search_gymnasium:SearchEnv",
+        "SceneEnvs/Denoising-v0",
+        f"{adapters}:DenoisingEnv",
+        vector_entry_point=f"{adapters}:DenoisingVectorEnv",
         disable_env_checker=True,
     )
-    gymnasium.register(
-        id="SceneEnvs/SearchMask-v0",
-        entry_point="scene_envs.envs.search_gymnasium:SearchMaskEnv",
-        disable_env_checker=True,
-    )
+    gymnasium.register("SceneEnvs/Search-v0", f"{search}:SearchEnv", disable_env_checker=True)
+    gymnasium.register("SceneEnvs/SearchMask-v0", f"{search}:SearchMaskEnv", disable_env_checker=True)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import inspect
 import shutil
-import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import NoneType
-from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, get_args, get_origin
 
 from docstring_parser import DocstringStyle, parse
 
@@ -18,13 +18,13 @@ from agents.configuration.composition import (
     build,
     by_hydra,
     check_option,
-    dotted,
     dotted_values,
     field_options,
     group_options,
+    hint_of,
     merged,
-    plain_tree,
-    reason_of,
+    parse_config,
+    verbatim,
 )
 from agents.configuration.prior_names import adapted_name
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
@@ -154,17 +154,13 @@ def _heading(field: dataclasses.Field[Any], chosen: str, config_dir: str) -> str
 def format_rows(rows: Sequence[tuple[str, str]]) -> str:
     """Two columns, the second wrapped to the terminal."""
     width = max(60, min(shutil.get_terminal_size().columns, 120))
-    left = min(34, max(len(name) for name, _ in rows)) + 4
-    lines = []
-    for name, meaning in rows:
-        wrapped = textwrap.wrap(meaning, width - left) or [""]
-        head = f"  {name}"
-        if len(head) > left - 2:
-            lines.append(head)
-            head = ""
-        lines.append(head.ljust(left) + wrapped[0])
-        lines.extend(" " * left + line for line in wrapped[1:])
-    return "\n".join(line.rstrip() for line in lines)
+    formatter = argparse.HelpFormatter("", max_help_position=38, width=width)
+    formatter.start_section(None)
+    formatter.add_arguments(
+        argparse.Action([], name, metavar=name, help=meaning.replace("%", "%%")) for name, meaning in rows
+    )
+    formatter.end_section()
+    return formatter.format_help().rstrip()
 
 
 def compose(command: str, config: type, words: Sequence[str], config_dir: str = "", config_file: str = "") -> Any:
@@ -187,7 +183,6 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
     tree.pop("output", None)  # a run that is started again has a folder of its own
     choices: dict[str, str] = {}
     values: dict[str, Any] = {}
-    texts: dict[str, Any] = {}
     adapter = ""
     for word in words:
         key, equals, value = word.partition("=")
@@ -205,7 +200,7 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
             choices[key] = value
             values.pop(key, None)
         elif _is_text(hint := _hint(config, key), value):
-            texts[key] = None if value == "null" and NoneType in get_args(hint) else value
+            values[key] = None if value == "null" and NoneType in get_args(hint) else verbatim(value)
         else:
             values.pop(key, None)  # later words come later
             values[key] = _parsed(command, key, value)
@@ -213,12 +208,10 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
                 choices.pop(key, None)
     if config_file and "recipe" in choices:
         raise InvalidInputError("recipe= and --config exclude each other: the file says everything already")
-    tree = {key: value for key, value in tree.items() if key not in choices}
+    replaced = {*choices, *(key for key in values if key in fields and fields[key].metadata.get("named"))}
+    tree = verbatim({key: value for key, value in tree.items() if key not in replaced})
     made = by_hydra(command, config, choices, config_dir)
     for key, value in values.items():
-        made = _with(made, key, value, config, tree)
-    made = _resolved(command, config, made, {**plain_tree(config()), **tree})
-    for key, value in texts.items():
         made = _with(made, key, value, config, tree)
     settings: Any = build(config, merged(tree, made), command=command)
     if not adapter:
@@ -230,17 +223,12 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
 
 def read_config(path: str) -> dict[str, Any]:
     """The values of a ``config.yaml``; an InvalidInputError without the file, a CorruptFileError without a mapping."""
-    import yaml
-
     try:
-        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        return parse_config(Path(path).read_text(encoding="utf-8"), f"--config {path}")
     except OSError as error:
         raise InvalidInputError(f"--config {path}: {error.strerror}; name the config.yaml of a run") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CorruptFileError(f"--config {path} is not YAML ({str(error).splitlines()[0]})") from error
-    if not isinstance(found, dict):
-        raise CorruptFileError(f"--config {path} holds no keys")
-    return found
+    except UnicodeDecodeError as error:
+        raise CorruptFileError(f"--config {path} is not YAML ({error})") from error
 
 
 def _is_option(field: dataclasses.Field[Any], key: str, value: str, config_dir: str) -> bool:
@@ -257,9 +245,7 @@ def _hint(config: type, key: str) -> Any:
     """The type of a dotted key, Any where only the component knows it."""
     kind: Any = config
     for part in key.split("."):
-        if not dataclasses.is_dataclass(kind) or part not in (hints := get_type_hints(kind)):
-            return Any
-        kind = hints[part]
+        kind = hint_of(kind, part) if dataclasses.is_dataclass(kind) else Any
     return kind
 
 
@@ -278,11 +264,14 @@ def _parsed(command: str, key: str, value: str) -> Any:
     text = f"[{value}]" if "," in value and value[:1] not in _OPENING else value  # a,b is a list; to Hydra, a sweep
     try:
         found: Any = OverridesParser.create().parse_override(f"{key}={text}").value()
-        if not any(isinstance(item, Sweep) for item in (found if isinstance(found, list) else [found])):
-            return found
+        is_sweep = any(isinstance(item, Sweep) for item in (found if isinstance(found, list) else [found]))
     except (HydraException, ValueError):
-        pass
-    raise InvalidInputError(f"{command}: a value cannot be read: {key}={value[:200]}")
+        is_sweep = True
+    if is_sweep:
+        raise InvalidInputError(f"{command}: a value cannot be read: {key}={value[:200]}")
+    if isinstance(found, int) and abs(found) >= 2**63:
+        raise InvalidInputError(f"{key}= has {len(str(abs(found)))} digits; whole numbers end at 2^63")
+    return found
 
 
 def _with(made: Mapping[str, Any], key: str, value: Any, config: type, tree: Mapping[str, Any]) -> dict[str, Any]:
@@ -297,31 +286,3 @@ def _with(made: Mapping[str, Any], key: str, value: Any, config: type, tree: Map
     for part in reversed([head, *inner]):
         value = {part: value}
     return merged(made, value)
-
-
-def _resolved(command: str, config: type, made: dict[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    """The values, interpolations such as ``${seed}`` replaced by other values, or by the environment, by OmegaConf."""
-    found = {key: value for key, value in dotted(made).items() if "${" in str(value)}
-    if not found:
-        return made
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    plain = {key: value for key, value in dotted(others).items() if "${" not in str(value)}
-    context = OmegaConf.create({})
-    try:
-        for key, value in {**plain, **dotted(made)}.items():
-            OmegaConf.update(context, key, value, force_add=True)
-        for key in found:
-            value = OmegaConf.select(context, key)
-            if OmegaConf.is_config(value):
-                value = OmegaConf.to_container(value, resolve=True)
-            elif isinstance(value, str) and not _is_text(_hint(config, key), value):
-                value = _parsed(command, key, value)  # the environment has texts alone
-            made = _with(made, key, value, config, {})
-    except OmegaConfBaseException as error:
-        raise InvalidInputError(
-            f"{command}: {error.full_key}: {reason_of(error)}; ${{KEY}} is the value of another key, ${{oc.env:NAME}} "
-            "that of the environment"
-        ) from error
-    return made

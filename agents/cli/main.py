@@ -28,7 +28,6 @@ from agents.configuration.composition import (
     config_text,
     known_masks,
     known_rewards,
-    known_scenes,
 )
 from agents.configuration.prior_names import find_prior, split_name
 from agents.utils.interrupts import Terminated, terminable
@@ -45,6 +44,7 @@ from scene_envs.errors import (
 )
 from scene_envs.files import find_scenes
 from scene_envs.registry import ALLOWED, FILES, PluginError, run_file
+from scene_envs.scene_types import list_scene_types
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -332,7 +332,7 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     if (scene := getattr(settings, "scene", None)) is not None and not isinstance(scene, str):
         raise InvalidInputError(f"scene={str(scene)[:200]}: give the name of one scene type, or several joined by +")
     for scene in str(getattr(settings, "scene", "") or "").split("+"):
-        _check_name("scene type", scene, known_scenes)
+        _check_name("scene type", scene, list_scene_types)
     for mask in [getattr(settings, "mask", None), *(getattr(settings, "masks", None) or [])]:
         _check_name("mask", mask, known_masks)
     device = getattr(settings, "device", "auto")
@@ -344,7 +344,8 @@ def _check(settings: Any, module: ModuleType, allow_local: bool) -> None:
     kept = {"regularisation.scenes"} if resumed else set()  # a resumed run has them in its folder
     for key in set(_DATASETS) - kept - set(getattr(settings, "NO_PATHS", ())):
         _check_dataset(key, functools.reduce(lambda value, part: getattr(value, part, None), key.split("."), settings))
-    _check_guidance(settings)
+    if getattr(settings, "prompt", None) == "":
+        raise InvalidInputError("prompt= is empty; give a text, or null for no prompt")
     if (physics := getattr(settings, "physics", "auto")) != "auto":  # what auto takes is said in the log of the run
         from scene_envs.physics.engines import engine_name
 
@@ -382,16 +383,3 @@ def _check_dataset(key: str, value: Any) -> None:
             raise InvalidInputError(
                 f"{key}={value[:200]!r}: nothing is at {part[:200]!r}; name a dataset, as scene-envs generate makes one"
             )
-
-
-def _check_guidance(settings: Any) -> None:
-    from agents.post_training.settings import check_prompt
-    from scene_envs.envs.settings import check_claim_guidance, check_guidance, check_physics_guidance
-
-    prompt = getattr(settings, "prompt", "those of real scenes")
-    check_prompt(prompt)
-    check_guidance(prompt, getattr(settings, "guidance", 0.0))
-    if strength := getattr(settings, "claim_guidance", 0.0):
-        check_claim_guidance(prompt, strength)
-    if strength := getattr(settings, "physics_guidance", 0.0):
-        check_physics_guidance(strength)

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from agents.configuration.composition import config_text, dotted
+from agents.configuration.composition import check_same_keys, config_text, parse_config
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import claimed, read_sealed, sealed, storage_error, write_json, write_text
 
@@ -125,28 +125,17 @@ class Run:
         return True
 
     def _check_keys(self) -> None:
-        import yaml
-
         path = self.directory / "config.yaml"
         try:
-            before = yaml.safe_load(read_sealed(path))
+            before = parse_config(read_sealed(path), repr(str(path)))
         except OSError:
             return
-        except (CorruptFileError, yaml.YAMLError) as error:
-            raise _unreadable(path, " ".join(str(error).split())) from error
-        if not isinstance(before, dict):
-            raise _unreadable(path, f"{str(path)!r} holds no keys")
-        was, is_now = dotted(before), dotted(yaml.safe_load(config_text(self.settings)))
-        changed = [
-            f"{key} was {was[key]!r}, is {is_now[key]!r}"
-            for key in is_now
-            if key in was and was[key] != is_now[key] and key.partition(".")[0] not in _MAY_DIFFER
-        ]
-        if changed:
-            raise InvalidInputError(
-                f"output={str(self.directory)!r} was written with other keys ({'; '.join(changed)[:500]}); "
-                "give another output, or the same keys to write it again"
-            )
+        except CorruptFileError as error:
+            raise CorruptFileError(
+                f"{error}, so whether {str(self.directory)!r} was written with these keys cannot be told; give another "
+                f"output, or remove {path.name} to write into the folder all the same"
+            ) from error
+        check_same_keys(self.directory, before, parse_config(config_text(self.settings), ""), _MAY_DIFFER)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -206,13 +195,6 @@ class Run:
             logger.setLevel(logging.DEBUG)  # details for the file alone
             for handler in self._handlers:
                 logger.addHandler(handler)
-
-
-def _unreadable(path: Path, reason: str) -> CorruptFileError:
-    return CorruptFileError(
-        f"{reason}, so whether {str(path.parent)!r} was written with these keys cannot be told; give another output, "
-        f"or remove {path.name} to write into the folder all the same"
-    )
 
 
 def _writer(folder: Path) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import dataclasses
 import functools
@@ -11,7 +10,7 @@ import math
 import re
 import sys
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from importlib.util import find_spec
@@ -20,11 +19,27 @@ from types import NoneType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from agents.utils.loggers import LOGGERS
-from scene_envs.errors import Checked, Count, InvalidInputError, Natural, OneOf, Positive, Seed, unknown_name
-from scene_envs.registry import load_plugins, plugin_entry_points
+from scene_envs.envs.settings import check_claim_guidance, check_guidance
+from scene_envs.errors import (
+    Checked,
+    CorruptFileError,
+    Count,
+    InvalidInputError,
+    Limit,
+    Natural,
+    OneOf,
+    Positive,
+    Seed,
+    unknown_name,
+)
+from scene_envs.progress import STYLES
+from scene_envs.registry import plugin_entry_points
+from scene_envs.scene_types import list_scene_types
 
 Config = TypeVar("Config")
 Kind = TypeVar("Kind", bound=type)
+Texts = Annotated[Any, str | list[str] | None]
+"""Type of a key that takes a text or several; OmegaConf has no union with a list, so the dataclass checks the value."""
 
 _WANTED: dict[Any, str] = {
     int: "a whole number",
@@ -33,8 +48,6 @@ _WANTED: dict[Any, str] = {
     str: "a text",
     NoneType: "null",
 }
-PROGRESS_STYLES = ("bar", "lines", "none")
-"""How progress is shown, as in :data:`scene_envs.progress.STYLES`."""
 
 
 def check_types(kind: type, values: Mapping[str, Any]) -> None:
@@ -52,62 +65,100 @@ def check_types(kind: type, values: Mapping[str, Any]) -> None:
         value = values[name]
         fits = type(value) in plain or (float in plain and type(value) is int)
         if not fits or (isinstance(value, float) and not math.isfinite(value)):
-            _refuse(wanted, value, name)
+            raise _refusal(wanted, value, name)
 
 
 # Dataclasses from nested mappings and back
 
 
 def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: str = "") -> Config:
-    """An instance of the dataclass ``kind`` from a nested mapping; missing keys keep their defaults. ``path`` is the
-    place of ``tree`` in messages, such as ``"optimizer."``.
+    """An instance of the dataclass ``kind`` from a nested mapping, as a structured config of OmegaConf: missing keys
+    keep their defaults, values are converted to the types of the fields, and interpolations are resolved. ``path`` is
+    the place of ``tree`` in messages, such as ``"optimizer."``.
 
     Raises:
         UnknownNameError: a key that ``kind`` does not have; the nearest one is offered.
         InvalidInputError: a value is not of the type of its key.
     """
-    defaults = {
-        field.name: field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
-        for field in dataclasses.fields(kind)  # type: ignore[arg-type]
-    }
-    values = defaults | field_values(kind, tree, path, command)
-    return kind(**{name: value for name, value in values.items() if value is not dataclasses.MISSING})
+    from omegaconf import OmegaConf
+    from omegaconf.errors import ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
+
+    OmegaConf.register_new_resolver("text", lambda code: bytes.fromhex(code[1:]).decode(), replace=True)
+    schema, values = OmegaConf.structured(kind), dict(tree)
+    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
+        value = values.get(field.name)
+        if field.metadata.get("kinds") and isinstance(value, Mapping):
+            schema[field.name] = OmegaConf.structured(_kind_of(field, value))
+        elif field.metadata.get("named") and field.name in values:
+            if isinstance(value, int | float):
+                typed = as_command_line_text(value)[:60]
+                raise InvalidInputError(f"{path}{field.name}={typed} is neither a name nor a mapping with a name")
+            values[field.name] = _shortest(value)
+    try:
+        made: Any = OmegaConf.to_object(OmegaConf.merge(schema, values))
+    except InterpolationResolutionError as error:
+        raise InvalidInputError(
+            f"{command}: {error.full_key}: {reason_of(error)}; ${{KEY}} is the value of another key, ${{oc.env:NAME}} "
+            "that of the environment"
+        ) from error
+    except ConfigKeyError as error:
+        known = [path + key for key in dotted(OmegaConf.to_container(schema))]  # type: ignore[arg-type]
+        raise unknown_name(f"{command} key".strip(), f"{path}{error.full_key}", known) from error
+    except OmegaConfBaseException as error:
+        _require_groups(schema, values, path)
+        place = (error.full_key or "").partition("[")[0]
+        parent, _, name = place.rpartition(".")
+        hint = hint_of(OmegaConf.get_type(schema, parent or None), name)
+        value = functools.reduce(lambda inner, key: inner[key], place.split("."), values)
+        raise _refusal(hint, value, path + place) from error
+    return made
 
 
-def field_values(kind: type, tree: Mapping[str, Any], path: str = "", command: str = "") -> dict[str, Any]:
-    """The values of ``tree``, converted to the types of the fields of ``kind``."""
-    fields = {field.name: field for field in dataclasses.fields(kind)}
-    hints = get_type_hints(kind)
-    values = {}
-    for key, value in tree.items():
-        if key not in fields:
-            known = [path + name for name in fields]
-            raise unknown_name(f"{command} key".strip(), path + str(key), known)
-        values[key] = convert(fields[key], hints[key], value, path + key, command)
-    return values
+def _require_groups(schema: Any, values: Mapping[str, Any], path: str) -> None:
+    """Refuse a value in the place of a group of keys."""
+    from omegaconf import DictConfig, OmegaConf
+
+    for key, value in values.items():
+        if isinstance(group := schema[key], DictConfig) and dataclasses.is_dataclass(OmegaConf.get_type(group)):
+            if not isinstance(value, Mapping):
+                raise _no_group(path + key, value, group)
+            _require_groups(group, value, f"{path}{key}.")
 
 
-def convert(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, command: str = "") -> Any:
-    """``value``, converted for a field of type ``hint``."""
-    if field.metadata.get("named"):
-        if isinstance(value, int | float):
-            raise InvalidInputError(
-                f"{path}={as_command_line_text(value)[:60]} is neither a name nor a mapping with a name"
-            )
-        alone = isinstance(value, Mapping) and set(value) == {"name"}
-        return value["name"] if alone else plain_tree(value)
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            return value
-        if not isinstance(value, Mapping):
-            keys = ", ".join(f"{path}.{inner.name}" for inner in dataclasses.fields(hint))
-            raise InvalidInputError(
-                f"{path}={as_command_line_text(value)}: {path} is a group of keys; give one of {keys}"
-            )
-        if find := field.metadata.get("kinds"):  # the name of a component decides which settings it has
-            hint = find(value.get("name", getattr(field.default_factory, "name", "")))
-        return build(hint, value, f"{path}.", command)
-    return _scalar(hint, value, path)
+def _no_group(path: str, value: Any, keys: Iterable[Any]) -> InvalidInputError:
+    known = ", ".join(f"{path}.{key}" for key in keys)
+    return InvalidInputError(f"{path}={as_command_line_text(value)}: {path} is a group of keys; give one of {known}")
+
+
+def verbatim(value: Any) -> Any:
+    """Nested values in which OmegaConf reads all texts as they stand, also those that look like an interpolation."""
+    if isinstance(value, Mapping):
+        return {key: verbatim(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [verbatim(item) for item in value]
+    is_plain = not isinstance(value, str) or ("${" not in value and value != "???")
+    return value if is_plain else f"${{text:x{value.encode().hex()}}}"
+
+
+def _shortest(value: Any) -> Any:
+    """A component by its name alone, where a mapping holds no settings of it."""
+    return value["name"] if isinstance(value, Mapping) and set(value) == {"name"} else value
+
+
+def _kind_of(field: dataclasses.Field[Any], value: Mapping[str, Any]) -> Any:
+    """The dataclass of a group; where its keys depend on the name of a component, that of the component."""
+    kind: Any = field.default_factory
+    return kinds(value.get("name", kind.name)) if (kinds := field.metadata.get("kinds")) else kind
+
+
+def _group(field: dataclasses.Field[Any], value: Any) -> Any:
+    """The value of a field; of a group, which may be given as a mapping, its dataclass."""
+    kind: Any = field.default_factory
+    if not dataclasses.is_dataclass(kind) or dataclasses.is_dataclass(value):
+        return _shortest(value) if field.metadata.get("named") else value
+    if not isinstance(value, Mapping):
+        raise _no_group(field.name, value, [inner.name for inner in dataclasses.fields(kind)])
+    return build(_kind_of(field, value), verbatim(value), f"{field.name}.")
 
 
 def changed(config: Config, changes: Mapping[str, Any]) -> Config:
@@ -116,20 +167,18 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
     >>> changed(RewardLimitKeys(), {"reward_limits.timeout": 3})
     RewardLimitKeys(reward_limits=RewardLimits(timeout=3.0, memory=1.0))
     """
-    whole: dict[str, Any] = {}
-    parts: dict[str, Any] = {}
+    fields = {field.name: field for field in dataclasses.fields(config)}  # type: ignore[arg-type]
+    values: dict[str, Any] = {}
     for key, value in changes.items():
         head, *inner = key.split(".")
-        if not hasattr(config, head):
+        if head not in fields:
             raise unknown_name("key", key, dotted_values(config))
-        if not inner:
-            whole[head] = value
-            continue
         for part in reversed(inner):
             value = {part: value}
-        before = plain_tree(parts.get(head, whole.get(head, getattr(config, head))))
-        parts[head] = merged(before, value) if isinstance(before, Mapping) else value
-    return dataclasses.replace(config, **{**whole, **field_values(type(config), parts)})  # type: ignore[type-var]
+        before = plain_tree(values.get(head, getattr(config, head)))
+        values[head] = merged(before, value) if inner and isinstance(before, Mapping) else value
+    groups = {name: _group(fields[name], value) for name, value in values.items() if isinstance(value, Mapping)}
+    return dataclasses.replace(config, **{**values, **groups})  # type: ignore[type-var]
 
 
 def dotted_values(config: Any) -> dict[str, Any]:
@@ -154,6 +203,26 @@ def dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def check_same_keys(
+    folder: Path, before: Mapping[str, Any], now: Mapping[str, Any], may_differ: Collection[str]
+) -> None:
+    """Refuse to go on in a folder that was written with other values of keys, but for those that ``may_differ``; keys
+    of only one of the two do not count.
+    """
+    heads = [key for key in now if key in before and key not in may_differ and before[key] != now[key]]
+    was, is_now = (dotted({key: values[key] for key in heads}) for values in (before, now))
+    told = [
+        f"{key} was {was.get(key)!r}, is {is_now.get(key)!r}"
+        for key in {**was, **is_now}
+        if was.get(key) != is_now.get(key)
+    ]
+    if told:
+        raise InvalidInputError(
+            f"output={str(folder)!r} was written with other keys ({'; '.join(told)[:500]}); give another output, or "
+            "the same keys to go on there"
+        )
+
+
 def plain_tree(value: Any) -> Any:
     """A config as nested mappings, lists, numbers and strings; other values stay as they are."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -174,38 +243,27 @@ def config_text(values: Any) -> str:
     return yaml.safe_dump({key: tree[key] for key in [*own_first, *tree]}, sort_keys=False)
 
 
-def _scalar(hint: Any, value: Any, path: str) -> Any:
-    origin, arguments = get_origin(hint), get_args(hint)
-    if hint is Any:
-        return plain_tree(value)
-    if origin in (Union, types.UnionType):
-        if value is None and NoneType in arguments:
-            return None
-        for option in sorted(arguments, key=lambda option: option is str):  # a list of texts before a text
-            with contextlib.suppress(InvalidInputError):
-                return _scalar(option, value, path)
-        return _refuse(hint, value, path)
-    if origin in (list, tuple):
-        if not isinstance(value, list | tuple):
-            _refuse(hint, value, path)
-        return origin(_scalar(arguments[0], item, path) for item in value) if arguments else origin(value)
-    if origin is dict:
-        return plain_tree(value) if isinstance(value, Mapping) else _refuse(hint, value, path)
-    if hint is float and isinstance(value, int | float | str) and not isinstance(value, bool):
-        try:
-            return float(value)  # YAML reads 1e-4 as a text
-        except (ValueError, OverflowError):
-            _refuse(hint, value, path)
-    if hint is str and isinstance(value, int | float) and not isinstance(value, bool):
-        return str(value)
-    if hint is int and isinstance(value, int) and abs(value) >= 2**63:
-        raise InvalidInputError(f"{path} is a number of {len(str(abs(value)))} digits; whole numbers end at 2^63")
-    right = isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
-    return value if right else _refuse(hint, value, path)
+def parse_config(text: str, place: str) -> dict[str, Any]:
+    """The values in the text of a ``config.yaml``; a CorruptFileError, which names its ``place``, without a mapping."""
+    import yaml
+
+    try:
+        found = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise CorruptFileError(f"{place} is not YAML ({str(error).splitlines()[0]})") from error
+    if not isinstance(found, dict):
+        raise CorruptFileError(f"{place} holds no keys")
+    return found
 
 
-def _refuse(hint: Any, value: Any, path: str) -> Any:
-    raise InvalidInputError(f"{path}={as_command_line_text(value)[:300]} is not {_wanted(hint)}")
+def _refusal(hint: Any, value: Any, path: str) -> InvalidInputError:
+    return InvalidInputError(f"{path}={as_command_line_text(value)[:300]} is not {_wanted(hint)}")
+
+
+def hint_of(kind: Any, name: str) -> Any:
+    """The type of a field, Any where only a component knows it."""
+    hint = get_type_hints(kind, include_extras=True).get(name, Any)
+    return hint.__metadata__[0] if hint == Texts else get_type_hints(kind).get(name, Any)
 
 
 def _wanted(hint: Any) -> str:
@@ -288,16 +346,7 @@ def known_masks() -> list[str]:
     return sorted({*MASKS, *plugin_entry_points("scene_envs.masks")})
 
 
-def known_scenes() -> list[str]:
-    """Names of scene types; imports the modules of installed packages that register more."""
-    from scene_envs.scene_types import list_scene_types
-
-    if plugin_entry_points("scene_envs.grammars"):
-        load_plugins("scene_envs.grammars")
-    return list_scene_types()
-
-
-_REGISTERED = {"reward": known_rewards, "mask": known_masks, "scene": known_scenes}
+_REGISTERED = {"reward": known_rewards, "mask": known_masks, "scene": list_scene_types}
 
 
 def group_options(folder: str, config_dir: str = "") -> list[str]:
@@ -355,14 +404,10 @@ def _complete(kind: type, given: Mapping[str, Any], fields: Mapping[str, datacla
         choices["recipe"] = given["recipe"]
         check_option("recipe", given["recipe"], group_options("recipe"))
     tree = by_hydra(kind.__name__, kind, choices)
-    values = field_values(kind, {name: value for name, value in tree.items() if name not in given})
-    for name, value in given.items():
-        values[name] = value
-        if dataclasses.is_dataclass(group := fields[name].default_factory) and isinstance(group, type):
-            base = tree.get(name, {})
-            whole = base if name in options else merged(base, value) if isinstance(value, Mapping) else value
-            values[name] = convert(fields[name], group, whole, name)
-    return values
+    for name in given.keys() - options:
+        is_part = dataclasses.is_dataclass(fields[name].default_factory) and isinstance(given[name], Mapping)
+        tree[name] = merged(tree.get(name, {}), given[name]) if is_part else given[name]
+    return {name: _group(fields[name], value) for name, value in tree.items()}
 
 
 # Composition: Hydra composes the options chosen, its parser reads single values, OmegaConf resolves interpolations
@@ -499,7 +544,7 @@ class ProgressKeys(Checked):
         progress: progress display: ``bar`` (lines where there is no terminal), ``lines`` or ``none``.
     """
 
-    progress: Annotated[str, OneOf(PROGRESS_STYLES)] = "bar"
+    progress: Annotated[str, OneOf(STYLES)] = "bar"
 
 
 @dataclass
@@ -517,6 +562,11 @@ class PromptKeys(Checked):
     guidance: float = 0.0
     claim_guidance: float = 0.0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_guidance(self.prompt, self.guidance)
+        check_claim_guidance(self.prompt, self.claim_guidance)
+
 
 @dataclass
 class SamplingKeys(PromptKeys):
@@ -533,6 +583,9 @@ class SamplingKeys(PromptKeys):
     seed: Seed = 0
 
 
+PhysicsGuidance = Annotated[float, Limit(lambda value: 0 <= value <= 1, "must be a number from 0 to 1")]
+
+
 @dataclass
 class DrawKeys(PrecisionKeys, DeviceKeys):
     """Samples of a prior.
@@ -545,7 +598,7 @@ class DrawKeys(PrecisionKeys, DeviceKeys):
     """
 
     num_steps: Count = 50
-    physics_guidance: float | None = None
+    physics_guidance: PhysicsGuidance | None = None
     seed: Seed = 0
 
 

@@ -198,7 +198,8 @@ def classifier_accuracy(
     check_classes(len(real), len(fake), seeds)
     generator = torch.Generator().manual_seed(seed)
     slots = max(real.tensor.shape[1], fake.tensor.shape[1])
-    both = SceneBatch(torch.cat([real.with_slots(slots).tensor, fake.with_slots(slots).tensor]).cpu(), real.scene_type)
+    scenes = [batch.to("cpu").with_slots(slots).tensor for batch in (real, fake)]
+    both = SceneBatch(torch.cat(scenes), real.scene_type)
     tokens = scene_tokens(blurred(both, *resolution, generator) if max(resolution) else both)
     width = real.scene_type.num_assets + 1
 

@@ -6,6 +6,9 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -247,82 +250,30 @@ def stack_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
 class Support:
     """Support of objects of a scene type: a surface fixed in the world, or the top of another object.
 
-    >>> [support.kind for support in SUPPORTS["dimsum_table"]]
+    >>> [support.kind for support in supports_of("dimsum_table")]
     ['table', 'stack']
     """
 
     kind: str  # name under which the height error is reported
     height: float  # m, in the world, or above the frame of the supporting object
-    on: tuple[str, ...] | None = None  # names of the supporting assets; None if the surface is fixed in the world
-    riders: tuple[str, ...] | None = None  # names of the assets that can rest there; None means all free ones
+    on: Sequence[str] | None = None  # names of the supporting assets; None if the surface is fixed in the world
+    riders: Sequence[str] | None = None  # names of the assets that can rest there; None means all free ones
     reach: float = 0.06  # largest horizontal distance (m) between the frames
     catch: float = 0.0  # height error (m) up to which a rider within reach is assigned here; for thin supports
 
 
-_FRUIT = (
-    "apple_gala", "apple_golden", "apple_green", "apple_red", "avocado_a", "avocado_b", "avocado_c", "pear_anjou",
-    "pear_bosc", "pear_red",
-)  # fmt: skip
-_UTENSILS = ("dinner_spoon", "fork", "knife", "teaspoon")
-_DISHES = ("dinner_plate", "serving_dish", "steamer_bottom", "steamer_lid", "teacup", "teapot")
-_STEAMERS = Support("stack", 0.091, on=("steamer_bottom",), riders=("steamer_bottom", "steamer_lid"))
-_TIERS = (-0.3915, -0.1232, 0.1392, 0.4075)
-_BIG_GAMES = ("board_game_l", "board_game_l2", "board_game_xl")
-_SHELF_LOADS = (
-    *_BIG_GAMES, "apple_gala", "board_game_s", "book", "bread_slice", "fruit_bowl", "game_case", "lamp", "pear_bosc",
-    "shared_plate", "soda_can", "speaker", "stacking_ring", "tea_bottle", "toy_train",
-)  # fmt: skip
-_PLATE, _CATCH = 0.006, 0.03
-"""Height (m) of the inside of plates and breakfast bowls, and ``catch`` (m) of the objects that lie there."""
+@cache
+def _tables() -> dict[str, Any]:
+    """Supports of scene types, and containers."""
+    import yaml
 
-_TABLE = Support("table", 0.0)
-_FOOD = (
-    Support("plate", _PLATE, on=("shared_plate",), riders=("apple_gala", "bread_slice", "pear_bosc"), catch=_CATCH),
-    Support("stack", 0.016, on=("bread_slice",), riders=("bread_slice",), catch=_CATCH),
-)
-_BREAKFAST = (
-    _TABLE,
-    *_FOOD,
-    Support("plate", _PLATE, on=("plate",), riders=("apple_gala", "bowl", "bread_slice", "pear_bosc"), catch=_CATCH),
-    Support("bowl", _PLATE, on=("bowl",), riders=("apple_gala", "pear_bosc"), catch=_CATCH),
-)
-_GAMES = (
-    Support("stack", 0.055, on=("board_game_l", "board_game_xl"), riders=_BIG_GAMES),
-    Support("stack", 0.069, on=("board_game_l2",), riders=_BIG_GAMES),
-    Support("stack", 0.060, on=("board_game_s",), riders=("board_game_s",)),
-    Support("stack", 0.0125, on=("game_case",), riders=("game_case",)),
-)
-_SHELF = tuple(Support("tier", height) for height in _TIERS)
-_RESTAURANT = (
-    Support("furniture", 0.0, riders=("cafe_table",)),
-    Support("furniture", -0.3775, riders=("shelf",)),
-    Support("floor", -0.785, riders=("chair",)),
-    Support("table", 0.0, on=("cafe_table",), riders=_DISHES, reach=0.7),
-    _STEAMERS,
-    *(Support("tier", height, on=("shelf",), riders=_SHELF_LOADS, reach=0.34) for height in _TIERS),
-    *_GAMES,
-    *_FOOD,
-)
+    found: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("supports.yaml").read_text("utf-8"))
+    return found
 
-SUPPORTS: dict[str, tuple[Support, ...]] = {
-    "breakfast_table_high_clutter": _BREAKFAST,
-    "breakfast_table_low_clutter": _BREAKFAST,
-    "dimsum_table": (_TABLE, _STEAMERS),
-    "living_room_shelf": (*_SHELF, *_GAMES, *_FOOD),
-    "pantry_shelf": _SHELF,
-    "restaurant_high_clutter": _RESTAURANT,
-    "restaurant_low_clutter": _RESTAURANT,
-}
-"""Supports of each scene type, by name; scene types without an entry have no height figures."""
 
-CONTAINERS = (
-    ("fruit_bowl", _FRUIT, 0.11, 0.15),
-    ("bowl", ("bread_slice",), 0.08, 0.10),
-    ("utensil_crock", _UTENSILS, 0.10, 0.20),
-)
-"""Hollow assets and the objects that may lie in them as they fell, which have no correct height and are left out; the
-largest horizontal distance (m) between the frames, and the largest height (m) of the object's frame above the
-container's. The smallest height is 1 cm."""
+def supports_of(scene_type: str) -> list[Support]:
+    """The supports of a scene type of this package, by name; none of any other."""
+    return [Support(**row) for row in _tables()["scene_types"].get(scene_type, ())]
 
 
 def category_distribution(batch: SceneBatch, eps: float = KL_EPS) -> Tensor:
@@ -360,11 +311,11 @@ def count_wasserstein(batch: SceneBatch, reference: SceneBatch) -> float:
 def height_errors(batch: SceneBatch, supports: Sequence[Support] | None = None) -> dict[str, Tensor]:
     """For each kind of support, (K,) m: how far each of its K objects floats above, or is sunk into, the support
     nearest to it in height. All fixed surfaces are candidates, and so are the objects within ``reach`` horizontally;
-    the rider must be above the frame of an object whose top is above its frame. Objects that lie in one of the
-    :data:`CONTAINERS` are left out. ``supports`` None takes those of the scene type.
+    the rider must be above the frame of an object whose top is above its frame. Objects that lie in a container as they
+    fell are left out. ``supports`` None takes those of the scene type.
     """
     if supports is None:
-        supports = SUPPORTS.get(batch.scene_type.name, ())
+        supports = supports_of(batch.scene_type.name)
     if not supports:
         return {}
     errors: dict[str, list[Tensor]] = {support.kind: [] for support in supports}
@@ -422,10 +373,10 @@ def _contained(batch: SceneBatch) -> Tensor:
     z = batch.translations[..., 2].double()
     rise = z.unsqueeze(2) - z.unsqueeze(1)  # (B, rider, container)
     inside = torch.zeros_like(batch.is_empty)
-    for name, riders, reach, depth in CONTAINERS:
-        if name in batch.scene_type.assets:
-            held = _near(batch, (name,), reach) & (rise > 0.01) & (rise <= depth)
-            inside |= held.any(dim=-1) & _is_one_of(batch, riders)
+    for container in _tables()["containers"]:
+        if container["name"] in batch.scene_type.assets:
+            held = _near(batch, [container["name"]], container["reach"]) & (rise > 0.01) & (rise <= container["depth"])
+            inside |= held.any(dim=-1) & _is_one_of(batch, container["riders"])
     return inside
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,15 +86,10 @@ def measure_samples(
     """
     if not len(batch) or not len(reference):
         raise InvalidInputError(f"cannot measure {len(batch)} scenes against {len(reference)}: both need at least one")
-    figures = {
-        **layout_figures(batch, reference),
-        **physics_figures(batch, pool),
-        **(ready_figures(batch, pool) if ready else {}),
-    }
-    if floor is not None:
-        real = measure_samples(floor, reference, pool=pool, ready=ready)
-        figures.update({FLOOR_PREFIX + name: value for name, value in real.items()})
-    return figures
+    figures = layout_figures(batch, reference) | physics_figures(batch, pool)
+    figures |= ready_figures(batch, pool) if ready else {}
+    real = {} if floor is None else measure_samples(floor, reference, pool=pool, ready=ready)
+    return figures | {FLOOR_PREFIX + name: value for name, value in real.items()}
 
 
 def evaluate(
@@ -363,61 +359,6 @@ MEASURES: dict[str, Callable[[EvaluationInputs], Figures]] = {
 """Groups of measures, in the order in which they are computed: cheap ones first."""
 
 
-READING: dict[str, str] = {
-    "num_steps": "denoiser evaluations per sample",
-    "physics_guidance": "strength of physics guidance of all samples",
-    "scenes": "samples measured",
-    "objects_mean": "objects per scene, welded ones included",
-    "objects_min": "in the emptiest scene",
-    "objects_max": "in the fullest scene",
-    "free_objects_mean": "objects per scene that are not welded",
-    "category_kl_e4": "KL(real ‖ samples) of the shares of assets, in 10⁻⁴ nats; lower is better",
-    "count_wasserstein": "distance of the distributions of objects per scene, in objects; lower is better",
-    "spacing_wasserstein_mm": "distance of the distributions of distances between neighbours; lower is better",
-    "tallest_stack_mean": "objects in the tallest stack of a scene",
-    "stack_wasserstein": "distance of the distributions of the tallest stack, in objects; lower is better",
-    "workspace_fraction": "objects in the workspace; higher is better",
-    "out_of_workspace_rate": "free objects outside the workspace; lower is better",
-    "duplicates": "samples that repeat another within 1 cm; lower is better",
-    r"height_error_(\w+)_p95_mm": "95 % quantile of the same",
-    r"height_error_(\w+)_mm": "median distance in height to the support ({}); lower is better",
-    "median_total_penetration_cm": "per scene, summed over pairs of convex parts (the literature's); lower is better",
-    "median_total_pair_penetration_cm": "per scene, the deepest overlap of each pair of objects; lower is better",
-    "collision_rate": "scenes with two objects more than 1 mm in each other; lower is better",
-    "furniture_collision_rate": "rooms in which a table or shelf is more than 1 mm in another; lower is better",
-    "overlapping_pairs": "penetrating pairs of objects per scene; lower is better",
-    "overlap_median_mm": "depth over the penetrating pairs; lower is better",
-    "overlap_p95_mm": "95 % quantile of the same",
-    "deeper_than_1mm_fraction": "free objects more than 1 mm in another; lower is better",
-    "deeper_than_1cm_fraction": "free objects more than 1 cm in another; lower is better",
-    "stable_fraction": "free objects that stay within 1 mm and 0.01 rad in simulation; higher is better",
-    "invalid_fraction": "scenes that the physics could not judge",
-    "feasible_objects": "free objects per scene that are neither deep in others nor move; higher is better",
-    "feasible_fraction": "the same as a share of free objects; higher is better",
-    "ready_invalid_fraction": "scenes that could not be made ready",
-    "ready_furniture_collision_rate": "rooms in which a table or shelf is still more than 1 mm in another",
-    "ready_objects": "feasible objects per scene after projection and settling; higher is better",
-    "ready_fraction": "the same as a share of free objects; higher is better",
-    "stable_2s_invalid_fraction": "scenes that could not be simulated for 2 s",
-    "stable_2s_fraction": "free objects that move < 1 cm and < 0.1 rad in 2 s, nothing removed; higher is better",
-    "classifier_accuracy": "accuracy of a set transformer, samples against real scenes; 0.5 is chance, lower is better",
-    "classifier_accuracy_std": "its spread over the seeds",
-    "render_accuracy": "accuracy of a CNN on their semantic renders; 0.5 is chance, lower is better",
-    "render_accuracy_std": "its spread over the seeds",
-    "frechet_scene_distance": "FSD, on features of a frozen set encoder (no FID); lower is better",
-    "prompt_guidance": "weight of classifier-free guidance of the samples with prompts; 0 for none",
-    "prompt_following": "samples of which every claim of their prompt is true; higher is better",
-    r"prompt_(counts|names|relations)": "the same among prompts on {}",
-    r"prompt_(counts|names|relations)_number": "how many prompts on {} there are",
-    "prompt_score": "mean partial credit; higher is better",
-    r"chance_prompt_\w+": "real scenes with the prompts of others: what ignoring the prompt scores",
-    "novelty": "median distance to the nearest training scene, over that of real scenes; 0 for copies, 1 when new",
-    "nearest_training_cm": "median distance per object to the nearest training scene",
-    "copied_fraction": "samples that repeat a training scene within 1 cm; lower is better",
-}
-"""How to read each figure, by its name or a pattern of it."""
-
-
 def figure_table(figures: Mapping[str, float]) -> str:
     """The figures as a Markdown table: samples, the real-against-real floor, and how to read each.
 
@@ -445,11 +386,19 @@ def how_to_read(name: str) -> str:
     >>> how_to_read("height_error_stack_mm")
     'median distance in height to the support (stack); lower is better'
     """
-    for pattern, text in READING.items():
+    for pattern, text in _reading().items():
         found = re.fullmatch(pattern, name)
         if found:
             return text.format(*found.groups())
     return ""
+
+
+@cache
+def _reading() -> dict[str, str]:
+    import yaml
+
+    found: dict[str, str] = yaml.safe_load(Path(__file__).with_name("reading.yaml").read_text("utf-8"))
+    return found
 
 
 def _number(value: float | None) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 from agents.configuration.composition import (
     DeviceKeys,
+    PhysicsGuidance,
     PrecisionKeys,
     SamplingKeys,
     composed,
@@ -74,7 +75,7 @@ class SearchConfig(BudgetKeys, SamplingKeys, PrecisionKeys, DeviceKeys):
     mask: Any = named("blamed_or_empty", "mask")
     masks: list[Any] | None = None
     objective_scale: float | None = None
-    physics_guidance: float = 0.0
+    physics_guidance: PhysicsGuidance = 0.0
     workers: Natural = 0
     physics: str = "auto"
     planner: PlannerSettings = nested(

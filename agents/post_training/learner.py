@@ -25,14 +25,7 @@ from agents.post_training.settings import (
 )
 from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup, gather_rows
-from rewards import (
-    RewardContext,
-    RewardOutput,
-    depends_on_batch,
-    learned_parts,
-    reward_name,
-)
-from rewards.base import facts_of
+from rewards import RewardContext, RewardOutput, facts_of, learned_parts, reward_name
 from rewards.evaluation import evaluate_reward
 from rewards.process import close_reward
 from scene_envs.arrays import Result, within_memory
@@ -80,7 +73,7 @@ class Learner:
         self.stds = policy.stds(self.slots).cpu()
         self.algorithm: Algorithm = make_algorithm(algorithm, policy, self.stds)
         self.learned = learned_parts(reward)
-        shared = self.processes.size > 1 and depends_on_batch(reward)
+        shared = self.processes.size > 1 and facts_of(reward)["depends_on_batch"]
         self.env = DenoisingTorchRLEnv(
             batch_size // self.processes.size,
             scene=self.prior.scene_type,

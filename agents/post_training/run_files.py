@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from agents.configuration.composition import dotted
+from agents.configuration.composition import check_same_keys
 from agents.post_training.settings import RESUMABLE
 from agents.utils.checkpoints import load_checkpoint
 from scene_envs import files
-from scene_envs.errors import InvalidInputError, TrainingError
+from scene_envs.errors import TrainingError
 from scene_envs.progress import Progress
 
 CHECKPOINT_NAME = "checkpoint.pt"
@@ -62,22 +62,8 @@ def load_resumable(directory: Path, config: Mapping[str, Any]) -> dict[str, Any]
     if not path.exists():
         return None
     state = load_checkpoint(path)
-    before, now = _flat(state.get("config", {})), _flat(config)
-    changed = [
-        name for name in now if name.partition(".")[0] not in RESUMABLE and before.get(name, now[name]) != now[name]
-    ]
-    if changed:
-        differences = "; ".join(f"{name} was {before[name]!r}, is {now[name]!r}" for name in changed)
-        raise InvalidInputError(
-            f"{str(directory)!r} holds a run with another configuration ({differences}); "
-            "give another output, or the same settings to resume it"
-        )
+    check_same_keys(directory, state.get("config", {}), config, RESUMABLE)
     return state
-
-
-def _flat(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration with nested keys joined by dots; the reward stays one value, even if it is a mapping."""
-    return {**dotted({**config, "reward": None}), "reward": config.get("reward")}
 
 
 REWARD_COLOR, GUARD_COLOR, FAINT = "#0f766e", "#b45309", "#99a3ad"

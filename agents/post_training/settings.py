@@ -16,6 +16,7 @@ from agents.configuration.composition import (
     ProgressKeys,
     RewardLimitKeys,
     SamplingKeys,
+    Texts,
     TrainingKeys,
     composed,
     named,
@@ -23,7 +24,7 @@ from agents.configuration.composition import (
     plain_tree,
 )
 from agents.utils.loggers import LOGGERS
-from scene_envs.envs.settings import PROMPT_SOURCES, check_claim_guidance, check_guidance
+from scene_envs.envs.settings import PROMPT_SOURCES
 from scene_envs.errors import (
     BELOW_ONE,
     Checked,
@@ -457,7 +458,7 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
 
     prior: str = "dimsum_table"
     reward: Any = named("object_count", "reward")
-    prompt: str | list[str] | None = None  # type: ignore[assignment]
+    prompt: Texts = None
     num_steps: Count = 25
     algorithm: AlgorithmSettings = nested(
         DDPOSFSettings, folder="algorithm", option="ddpo_sf", kinds=algorithm_settings, registered=list_algorithms
@@ -479,8 +480,6 @@ class PostTrainConfig(BatchKeys, SamplingKeys, TrainingKeys, ProgressKeys, Rewar
             )
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt)
-        check_guidance(self.prompt, self.guidance)
-        check_claim_guidance(self.prompt, self.claim_guidance)
         if self.claim_guidance and isinstance(self.algorithm, DDPOSFSettings):
             raise InvalidInputError(
                 f"claim_guidance={self.claim_guidance:g} changes how scenes are drawn, and "

@@ -16,7 +16,7 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
-from agents.configuration.composition import MAX_GRADIENT_NORM, config_text, dotted
+from agents.configuration.composition import MAX_GRADIENT_NORM, check_same_keys, config_text
 from agents.configuration.prior_names import short_name
 from agents.pretraining.initial_prior import TrainingData, prepare
 from agents.pretraining.optimizers import build_optimizer, learning_rate_at
@@ -258,17 +258,7 @@ class Pretrainer:
 
     def _load(self) -> None:
         state = load_checkpoint(self.checkpoint_path)
-        before, now = dotted(state["config"]), dotted(asdict(self.config))
-        differing = [
-            f"{key}={value}"
-            for key, value in before.items()
-            if key.partition(".")[0] not in _MAY_DIFFER and value != now.get(key, value)
-        ]
-        if differing:
-            raise InvalidInputError(
-                f"{str(self.directory)!r} holds a run that was started with {', '.join(differing)}; give the same keys "
-                "again to resume it, or another output"
-            )
+        check_same_keys(self.directory, state["config"], asdict(self.config), _MAY_DIFFER)
         facts, known = self._data_facts(), state.get("data")
         if known is not None and not (
             known["scenes"] == facts["scenes"] and torch.allclose(known["mean"], facts["mean"], rtol=1e-3, atol=1e-4)

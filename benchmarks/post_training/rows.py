@@ -103,9 +103,8 @@ def _counts() -> tuple[Row, ...]:
 
 
 def _prompts() -> tuple[Row, ...]:
-    """Prompts as reward, feasibility, and feasibility where the prompt is followed; with and without claim guidance."""
-    gated = "reward={name: gate, reward: feasible_share, condition: prompt_match, threshold: 1}"
-    rewards = {"match": "reward=prompt_match", "feasible": "reward=feasible_share", "gate": gated}
+    """Prompts as reward, and feasibility; with and without claim guidance."""
+    rewards = {"match": "reward=prompt_match", "feasible": "reward=feasible_share"}
     return tuple(
         Row(f"{prior}-{how}{label}-0", prior,
             (f"algorithm={FORWARD}", reward, "prompt=grammar", "seed=0", f"claim_guidance={strength}"), 60)
@@ -116,16 +115,11 @@ def _prompts() -> tuple[Row, ...]:
 
 
 def _realism() -> tuple[Row, ...]:
-    """A discriminator that learns online as reward, alone and gated with feasibility, and the likelihood as reward."""
-    gated = "reward={name: gate, reward: discriminator, condition: feasible_share, threshold: 0.7}"
+    """A discriminator that learns online as reward, and the likelihood as reward."""
     return tuple(
         Row(f"{prior}-{label}-0", prior, (f"algorithm={FORWARD}", reward, "seed=0"), 100)
         for prior in ("breakfast_table_high_clutter", "restaurant_low_clutter", "restaurant_high_clutter")
-        for label, reward in (
-            ("discriminator", "reward=discriminator"),
-            ("gated", gated),
-            ("realism", "reward=realism"),
-        )
+        for label, reward in (("discriminator", "reward=discriminator"), ("realism", "reward=realism"))
     )
 
 

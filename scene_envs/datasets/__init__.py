@@ -4,7 +4,6 @@ from scene_envs.datasets.dataset import SceneDataset, load_scenes, to_union
 from scene_envs.datasets.files import DatasetInfo, read_metadata
 from scene_envs.datasets.generation import GenerationReport, generate, judge_scenes
 from scene_envs.datasets.prompts import PromptFacts, SceneFacts, describe, describe_all, parse_prompt, scene_facts
-from scene_envs.errors import StorageError
 
 __all__ = [
     "DatasetInfo",
@@ -12,7 +11,6 @@ __all__ = [
     "PromptFacts",
     "SceneDataset",
     "SceneFacts",
-    "StorageError",
     "describe",
     "describe_all",
     "generate",

@@ -56,11 +56,10 @@ class SceneDataset:
 
     Attributes:
         tensor: (M, N, D) float32, raw (metres, rotation entries, one-hot).
-        prompts: M prompts, the first of each scene.
+        prompt_sets: M tuples, all prompts of each scene, at least one; a text stands for a tuple of it.
         normalizer: Normalizer of the files.
         scene_type: Scene type of the scenes.
         metadata: Content of ``metadata.json``.
-        prompt_sets: M tuples, all prompts of each scene, the one in ``prompts`` first.
 
     >>> scenes = SceneBatch.empty("dimsum_table", 10)
     >>> shifted = scenes.tensor.clone()
@@ -72,20 +71,22 @@ class SceneDataset:
     """
 
     tensor: Tensor
-    prompts: list[str]
+    prompt_sets: list[tuple[str, ...]]
     normalizer: Normalizer
     scene_type: SceneType
     metadata: dict[str, Any] = field(default_factory=dict)
-    prompt_sets: list[tuple[str, ...]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        if len(self.prompts) != self.tensor.shape[0]:
-            raise InvalidInputError(f"{self.tensor.shape[0]} scenes need as many prompts, got {len(self.prompts)}")
-        if not self.prompt_sets:
-            object.__setattr__(self, "prompt_sets", [(prompt,) for prompt in self.prompts])
-        firsts = [prompts[:1] for prompts in self.prompt_sets]
-        if firsts != [(prompt,) for prompt in self.prompts]:
-            raise InvalidInputError("prompt_sets needs one tuple per scene that starts with the scene's prompt")
+        sets = [(prompts,) if isinstance(prompts, str) else tuple(prompts) for prompts in self.prompt_sets]
+        if len(sets) != len(self) or not all(sets):
+            raise InvalidInputError(f"{len(self)} scenes need as many prompts or tuples of prompts, got {len(sets)}")
+        object.__setattr__(self, "prompt_sets", sets)
+        object.__setattr__(self, "scene_type", get_scene_type(self.scene_type))
+
+    @cached_property
+    def prompts(self) -> list[str]:
+        """M prompts, the first of each scene."""
+        return [prompts[0] for prompts in self.prompt_sets]
 
     @classmethod
     def load(
@@ -95,7 +96,6 @@ class SceneDataset:
         scene_type: str | SceneType | None = None,
         aliases: Mapping[str, str] | None = None,
         limit: int | None = None,
-        metadata: str | os.PathLike[str] | None = None,
         fixed_tolerance: float = FIXED_TOLERANCE,
         slots: int | None = None,
     ) -> SceneDataset:
@@ -111,7 +111,6 @@ class SceneDataset:
             scene_type: Scene type; None takes the one named in the metadata (datasets of others name none).
             aliases: Mapping of model paths, or their stems, to asset names, for datasets with other asset names.
             limit: Largest number of scenes to read.
-            metadata: Path of ``metadata.json``, when it is neither in the folder of the files nor in the folder above.
             fixed_tolerance: Largest distance (m, rotation entries) of fixed objects from the scene type's pose, which
                 they then get. ``math.inf`` accepts any pose.
             slots: N of the scenes, at least that of the files; None takes that of the files.
@@ -122,7 +121,8 @@ class SceneDataset:
             UnknownNameError: a model path that is no asset of the scene type.
         """
         files = find_files(path)
-        layout = make_layout(metadata or find_metadata(path), scene_type, aliases, fixed_tolerance, slots)
+        info = read_metadata(find_metadata(path))
+        layout = Layout(info, _known_type(info, scene_type), aliases or {}, fixed_tolerance, slots)
         parts: list[Tensor] = []
         sets: list[tuple[str, ...]] = []
         for rows in itertools.chain.from_iterable(read_rows(file, layout.info.features) for file in files):
@@ -133,9 +133,8 @@ class SceneDataset:
         width = max((part.shape[1] for part in parts), default=layout.scene_type.slots)
         padded = [SceneBatch(part, layout.scene_type).with_slots(width).tensor for part in parts]
         tensor = torch.cat(padded)[:limit] if parts else torch.empty(0, width, layout.scene_type.features)
-        dataset = cls.from_sets(tensor, sets[:limit], layout.normalizer, layout.scene_type, layout.info.metadata)
-        own = metadata is None and (Path(path) / METADATA).is_file()
-        if own and not dataset.complete and (limit is None or len(dataset) < limit):
+        dataset = cls(tensor, sets[:limit], layout.normalizer, layout.scene_type, layout.info.metadata)
+        if (Path(path) / METADATA).is_file() and not dataset.complete and (limit is None or len(dataset) < limit):
             _LOGGER.warning(
                 "%r holds %d of the %d requested scenes: shards are missing, or are still being generated; "
                 "run the same scene-envs generate command again to make the rest",
@@ -144,20 +143,6 @@ class SceneDataset:
                 int(dataset.metadata["count"]),
             )
         return dataset
-
-    @classmethod
-    def from_sets(
-        cls,
-        tensor: Tensor,
-        prompt_sets: Sequence[tuple[str, ...]],
-        normalizer: Normalizer,
-        scene_type: str | SceneType,
-        metadata: dict[str, Any] | None = None,
-    ) -> SceneDataset:
-        """From raw scenes (M, N, D) with a tuple of prompts each; the first of each tuple is the prompt."""
-        sets = list(prompt_sets)
-        first = [prompts[0] for prompts in sets]
-        return cls(tensor, first, normalizer, get_scene_type(scene_type), metadata or {}, sets)
 
     @property
     def complete(self) -> bool:
@@ -176,7 +161,7 @@ class SceneDataset:
         """A sub-dataset."""
         chosen = torch.arange(len(self))[index if isinstance(index, slice) else torch.as_tensor(index)]
         sets = [self.prompt_sets[i] for i in chosen.tolist()]
-        return self.from_sets(self.tensor[chosen], sets, self.normalizer, self.scene_type, self.metadata)
+        return SceneDataset(self.tensor[chosen], sets, self.normalizer, self.scene_type, self.metadata)
 
     def batch(self, index: slice | Sequence[int] | Tensor = slice(None)) -> SceneBatch:
         """Scenes as a :class:`~scene_envs.scene.SceneBatch`."""
@@ -210,7 +195,6 @@ class SceneDataset:
         folder = Path(output)
         if any(folder.glob("*.parquet")):
             raise InvalidInputError(f"{str(folder)!r} already holds parquet files; choose an empty folder")
-        folder.mkdir(parents=True, exist_ok=True)
         metadata = make_metadata(self.scene_type, self.normalizer, count=len(self))
         metadata["max_num_objects_per_scene"] = self.tensor.shape[1]
         write_metadata(folder, metadata)
@@ -249,7 +233,7 @@ def to_union(batch: SceneBatch, union: SceneType) -> SceneBatch:
     """
     known = {name: index for index, name in enumerate(union.assets)}
     table = torch.tensor([known.get(name, -1) for name in batch.scene_type.assets] + [union.num_assets])
-    categories = table[batch.categories]
+    categories = table.to(batch.tensor.device)[batch.categories]
     if bool((categories < 0).any()):
         scene, slot = torch.nonzero(categories < 0)[0].tolist()
         asset = batch.scene_type.assets[int(batch.categories[scene, slot])]
@@ -270,25 +254,16 @@ def union_normalizer(normalizers: Sequence[Normalizer], union: SceneType) -> Nor
     return Normalizer.from_range(low, high)
 
 
-def make_layout(
-    metadata: str | os.PathLike[str],
-    scene_type: str | SceneType | None,
-    aliases: Mapping[str, str] | None,
-    fixed_tolerance: float,
-    slots: int | None,
-) -> Layout:
-    """Layout of files with this ``metadata.json``; arguments and errors as for :meth:`SceneDataset.load`."""
-    info: DatasetInfo = read_metadata(metadata)
-    name = scene_type if scene_type is not None else info.scene_type
-    if name is None:
+def _known_type(info: DatasetInfo, scene_type: str | SceneType | None) -> SceneType:
+    """The scene type, or the one that the metadata name; errors as for :meth:`SceneDataset.load`."""
+    if scene_type is not None:
+        return get_scene_type(scene_type)
+    if info.scene_type is None:
         raise InvalidInputError(f"{str(info.path)!r} names no scene type; pass scene_type=")
     try:
-        known = get_scene_type(name)
+        return get_scene_type(info.scene_type)
     except (InvalidInputError, UnknownNameError) as error:
-        if scene_type is not None:
-            raise
         raise type(error)(f"{str(info.path)!r}: {error} Register it, or pass scene_type=") from error
-    return Layout(info, known, aliases or {}, fixed_tolerance, slots)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -107,46 +108,46 @@ def encode_shard(
     return bytes(sink.getvalue().to_pybytes())
 
 
+@contextmanager
+def _reading(problem: str, remedy: str = "delete it and generate again to remake it") -> Iterator[None]:
+    """Context in which an error of arrow is a CorruptFileError that names the ``problem`` and the ``remedy``."""
+    try:
+        yield
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise CorruptFileError(f"{problem} ({str(error)[:200]}); {remedy}") from error
+
+
 def read_notes(path: Path) -> dict[str, Any]:
     """The facts that :func:`encode_shard` kept in the footer, and ``rows``; raises CorruptFileError."""
     file = open_parquet(path)
     footer = file.schema_arrow.metadata or {}
-    try:
-        notes = without_digest(json.loads(footer.get(_NOTES, b"{}")), path)
-        rows = file.metadata.num_rows
+    rows = file.metadata.num_rows
+    with _reading(f"{str(path)!r} has a damaged footer"):
+        try:
+            notes = without_digest(json.loads(footer.get(_NOTES, b"{}")), path)
+        except (TypeError, AttributeError, CorruptFileError) as error:
+            raise ValueError(error) from error
         if notes.get("rows", rows) != rows:
             raise ValueError(f"{notes['rows']} rows were written, the file has {rows}")
-        return {**notes, "rows": rows}
-    except (ValueError, TypeError, AttributeError, CorruptFileError) as error:
-        raise CorruptFileError(
-            f"{str(path)!r} has a damaged footer; delete it and generate again to remake it"
-        ) from error
+    return {**notes, "rows": rows}
 
 
 def verify(path: Path) -> None:
     """Read all of a shard, whose pages carry checksums; raises CorruptFileError."""
     file = open_parquet(path)
-    try:
+    with _reading(f"{str(path)!r} is damaged"):
         for _ in file.iter_batches(_ROW_GROUP):
             pass
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise CorruptFileError(
-            f"{str(path)!r} is damaged ({str(error)[:200]}); delete it and generate again to remake it"
-        ) from error
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:
     """The parquet file at ``path``; raises InvalidInputError (none there) or CorruptFileError."""
-    try:
+    if not path.exists():
+        raise InvalidInputError(f"no parquet file at {str(path)!r}")
+    with _reading(f"{str(path)!r} is not a readable parquet file"):
         file = pq.ParquetFile(path, page_checksum_verification=True)
         _ = file.schema_arrow.names, file.metadata.num_rows  # reading these raises when they are damaged
         return file
-    except FileNotFoundError:
-        raise InvalidInputError(f"no parquet file at {str(path)!r}") from None
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise CorruptFileError(
-            f"{str(path)!r} is not a readable parquet file ({error}); delete it and generate again to remake it"
-        ) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,24 +206,14 @@ def read_rows(file: Path, features: int) -> Iterator[Rows]:
         parquet = open_parquet(file)
         batches = parquet.iter_batches(_BLOCK, columns=_columns(parquet.schema_arrow.names, place))
     while True:
-        try:
+        with _reading(f"cannot read {place!r} from row {start} on"):
             batch = next(batches, None)
-        except (pa.ArrowException, OSError, ValueError) as error:
-            raise CorruptFileError(
-                f"cannot read {place!r} from row {start} on: {error}; delete the file and generate again to remake it"
-            ) from error
         if batch is None:
             return
         if not batch.num_rows:
             continue
-        table = pa.Table.from_batches([batch])
-        try:
-            scenes, prompt_sets = _to_array(_one_array(table[SCENES]), features, start), _prompt_sets(table)
-        except (pa.ArrowException, ValueError) as error:
-            raise CorruptFileError(
-                f"cannot read scenes of {features} features per slot from {place!r}: {error}; "
-                "delete the file and generate again to remake it"
-            ) from error
+        with _reading(f"cannot read scenes of {features} features per slot from {place!r}"):
+            scenes, prompt_sets = _to_array(batch[SCENES], features, start), _prompt_sets(batch)
         yield Rows(scenes, prompt_sets, place, start)
         start += batch.num_rows
 
@@ -241,17 +232,15 @@ def _saved_files(folder: Path) -> list[Path]:
 
 def _arrow_table(file: Path) -> pa.Table:
     """The table of an arrow file, of the stream or the file format, mapped into memory rather than read."""
-    try:
+    if not file.exists():
+        raise InvalidInputError(f"no arrow file at {str(file)!r}")
+    with _reading(f"{str(file)!r} is not a readable arrow file", "fetch it again"):
         source = pa.memory_map(str(file))
         try:
             return pa.ipc.open_file(source).read_all()
         except pa.ArrowInvalid:
             source.seek(0)
             return pa.ipc.open_stream(source).read_all()
-    except FileNotFoundError:
-        raise InvalidInputError(f"no arrow file at {str(file)!r}") from None
-    except (pa.ArrowException, OSError) as error:
-        raise CorruptFileError(f"{str(file)!r} is not a readable arrow file ({error}); fetch it again") from error
 
 
 def _columns(names: Sequence[str], place: str) -> list[str]:
@@ -262,30 +251,20 @@ def _columns(names: Sequence[str], place: str) -> list[str]:
     return [name for name in (SCENES, PROMPTS, PROMPT_SETS) if name in names]
 
 
-def _prompt_sets(table: pa.Table) -> list[tuple[str, ...]]:
-    column = PROMPT_SETS if PROMPT_SETS in table.column_names else PROMPTS
-    first = table[PROMPTS].to_pylist()
+def _prompt_sets(batch: pa.RecordBatch) -> list[tuple[str, ...]]:
+    first = batch[PROMPTS].to_pylist()
+    column = batch[PROMPT_SETS].to_pylist() if PROMPT_SETS in batch.schema.names else first
     sets = []
-    for one, texts in zip(first, table[column].to_pylist(), strict=True):
+    for one, texts in zip(first, column, strict=True):
         listed = texts if isinstance(texts, list) else [texts]
         sets.append(tuple(text or "" for text in listed) or (one if isinstance(one, str) else "",))
     return sets
 
 
-def _one_array(column: pa.ChunkedArray) -> pa.Array:
-    """The column as one array; extension types (``Array2D`` of Hugging Face ``datasets``) give their storage."""
-    chunks = [chunk.storage if isinstance(chunk, pa.ExtensionArray) else chunk for chunk in column.chunks]
-    if not chunks:
-        kind = column.type.storage_type if isinstance(column.type, pa.BaseExtensionType) else column.type
-        return pa.array([], kind)
-    return pa.concat_arrays(chunks)
-
-
 def _to_array(column: pa.Array, features: int, start: int) -> NDArray[np.floating]:
     """Lists of M scenes as (M, N, D); raises ValueError when they are ragged, have gaps or another width."""
-    count = len(column)
-    if count == 0:
-        return np.empty((0, 0, features), dtype=np.float32)
+    if isinstance(column, pa.ExtensionArray):  # ``Array2D`` of Hugging Face ``datasets``
+        column = column.storage
     _check_complete(column, start, "scene")
     sizes = np.asarray(pc.list_value_length(column))
     inner = pc.list_flatten(column)
@@ -307,7 +286,7 @@ def _to_array(column: pa.Array, features: int, start: int) -> NDArray[np.floatin
     values = inner.to_numpy(zero_copy_only=False)
     if values.dtype == np.float16:
         values = values.astype(np.float32)
-    return values.reshape(count, int(sizes[0]), features)
+    return values.reshape(len(column), int(sizes[0]), features)
 
 
 def _is_list(column: pa.Array) -> bool:
@@ -393,10 +372,6 @@ def read_metadata(path: str | os.PathLike[str]) -> DatasetInfo:
     missing = [key for key in needed if not isinstance(metadata, dict) or key not in metadata]
     if missing:
         raise CorruptFileError(f"{str(file)!r} lacks the keys {missing}; a dataset's metadata needs {list(needed)}")
-    return _parse(file, metadata)
-
-
-def _parse(file: Path, metadata: dict[str, Any]) -> DatasetInfo:
     for key in ("model_paths", "welded_object_model_paths"):
         if not isinstance(metadata.get(key) or [], list):
             raise CorruptFileError(f"{str(file)!r}: {key} must be a list of paths, it is {str(metadata[key])[:100]}")

@@ -342,6 +342,7 @@ def judge_scenes(batch: SceneBatch, physics: str = "auto") -> list[str]:
     """
     from scene_envs.physics import feasibility
 
+    batch = batch.to("cpu")
     inside = (batch.in_workspace | batch.is_empty).all(dim=1)
     verdicts = ["outside workspace"] * len(batch)
     candidates = torch.nonzero(inside).flatten()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -22,9 +23,8 @@ from scene_envs.grammars.surface import (
     Region,
     Yaw,
     carrying_height,
-    foot_of,
+    heights_of,
     plan_of,
-    top_of,
 )
 from scene_envs.scene_types import Camera, FixedObject, SceneType
 
@@ -141,7 +141,7 @@ class Standing:
 
     def start(self, container: Asset, contents: Sequence[Asset], rng: np.random.Generator) -> list[ContentPose]:
         """Feet on a circle on the floor of the jar, shafts near its rim, all around."""
-        floor, rim = carrying_height(container), top_of(container)
+        _, rim, floor = heights_of(container)
         phase = rng.random() * 2.0 * math.pi
         poses = []
         for index, asset in enumerate(contents):
@@ -198,12 +198,26 @@ class Heap:
         return poses
 
 
+@lru_cache(maxsize=64)
+def _alone(whole: SceneType, container: str) -> SceneType:
+    """A scene type in which the container is welded to the origin."""
+    return SceneType(
+        name=f"{whole.name}:{container}",
+        assets=whole.assets,
+        slots=whole.slots,
+        workspace=((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)),
+        welded=(container,),
+        fixed=(FixedObject(container),),
+        camera=_NOWHERE,
+        asset_folders=whole.asset_folders,
+    )
+
+
 class Containers:
     """Filled containers of one scene type."""
 
     def __init__(self, scene_type: SceneType) -> None:
         self._scene_type = scene_type
-        self._settings: dict[str, SceneType] = {}
 
     def fill(
         self, container: str, contents: Sequence[str], filling: Filling, rng: np.random.Generator, reasons: Counter[str]
@@ -228,7 +242,7 @@ class Containers:
     def _batch(self, container: str, contents: Sequence[str], poses: Sequence[ContentPose]) -> SceneBatch:
         from scene_envs.scene import SceneBatch
 
-        scene_type = self._alone(container)
+        scene_type = _alone(self._scene_type, container)
         translations = torch.zeros(1, len(contents) + 1, 3)
         rotations = torch.eye(3).expand(1, len(contents) + 1, 3, 3).clone()
         for slot, (rotation, translation) in enumerate(poses, start=1):
@@ -237,22 +251,6 @@ class Containers:
         names = scene_type.assets
         categories = torch.tensor([[names.index(container), *(names.index(name) for name in contents)]])
         return SceneBatch.from_parts(translations, rotations, categories, scene_type)
-
-    def _alone(self, container: str) -> SceneType:
-        """A scene type in which the container is welded to the origin."""
-        if container not in self._settings:
-            whole = self._scene_type
-            self._settings[container] = SceneType(
-                name=f"{whole.name}:{container}",
-                assets=whole.assets,
-                slots=whole.slots,
-                workspace=((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)),
-                welded=(container,),
-                fixed=(FixedObject(container),),
-                camera=_NOWHERE,
-                asset_folders=whole.asset_folders,
-            )
-        return self._settings[container]
 
     @staticmethod
     def _is_inside(container: Asset, assets: Sequence[Asset], batch: SceneBatch) -> bool:
@@ -275,8 +273,6 @@ class Frame:
 
     def point(self, x: float, y: float) -> tuple[float, float]:
         """World (x, y) of a point of the frame."""
-        if self.yaw == 0.0:
-            return self.x + x, self.y + y
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         return self.x + cos * x - sin * y, self.y + sin * x + cos * y
 
@@ -297,9 +293,9 @@ class Layout:
         self.library = scene_type.library
         self.reasons = reasons
         self.containers = Containers(scene_type)
-        self._plans: dict[str, Plan] = {}
         self._outlines: dict[tuple[int, tuple[str, ...]], tuple[Surface, Outline]] = {}
-        self._heights: dict[str, tuple[float, float, float]] = {}
+        self._plan: Callable[[str], Plan] = cache(lambda asset: plan_of(self.library[asset]))
+        self._height: Callable[[str], tuple[float, float, float]] = cache(lambda asset: heights_of(self.library[asset]))
 
     def place(
         self, surface: Surface, towers: Sequence[Tower], frame: Frame, carrier: str | None, rng: np.random.Generator
@@ -405,18 +401,6 @@ class Layout:
             turned = tuple(float(value) for value in (turn @ rotation).ravel())
             poses.append(Pose(asset, (x, y, frame.z + float(translation[2])), turned))
         return poses
-
-    def _height(self, asset: str) -> tuple[float, float, float]:
-        """z of the foot, of the top, and of an object at rest in the middle, m, asset frame."""
-        if asset not in self._heights:
-            model = self.library[asset]
-            self._heights[asset] = foot_of(model), top_of(model), carrying_height(model)
-        return self._heights[asset]
-
-    def _plan(self, asset: str) -> Plan:
-        if asset not in self._plans:
-            self._plans[asset] = plan_of(self.library[asset])
-        return self._plans[asset]
 
     def _outline(self, surface: Surface, assets: tuple[str, ...]) -> Outline:
         key = id(surface), assets

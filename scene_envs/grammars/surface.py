@@ -273,20 +273,15 @@ def plan_of(asset: Asset) -> Plan:
     return Rectangle(*(float(v) for v in (*half, *np.round(center, 9))))
 
 
-def foot_of(asset: Asset) -> float:
-    """z of the lowest point of ``asset`` in its frame, m."""
-    return _tidy(asset.bounds[0, 2])
-
-
-def top_of(asset: Asset) -> float:
-    """z of the highest point of ``asset`` in its frame, m."""
-    return _tidy(asset.bounds[1, 2])
+def heights_of(asset: Asset) -> tuple[float, float, float]:
+    """z of the foot, of the top, and of an object at rest in the middle of ``asset``, m, asset frame."""
+    return _tidy(asset.bounds[0, 2]), _tidy(asset.bounds[1, 2]), carrying_height(asset)
 
 
 def carrying_height(asset: Asset) -> float:
     """z (m, asset frame) at which something in the middle of ``asset`` rests: a plate's base, the floor of a bowl."""
     height = max(float(upper_side(part, np.zeros((1, 1, 2)))[0, 0]) for part in asset.fine)
-    return _tidy(height) if height > -math.inf else top_of(asset)
+    return _tidy(height if height > -math.inf else asset.bounds[1, 2])
 
 
 def _tidy(value: float) -> float:

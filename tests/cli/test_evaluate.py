@@ -100,7 +100,7 @@ def test_other_keys_are_refused_and_other_weights_of_the_prior_measured_anew(
     before = {path.name: path.read_bytes() for path in out.iterdir() if path.name != "log.txt"}
     for other, told in (([f"prior={moved}", "seed=1"], "seed was 0, is 1"), ([f"prior={prior}"], "prior was")):
         assert main([*words, *other]) == 2
-        assert f"holds figures of other keys ({told}" in capsys.readouterr().err
+        assert f"was written with other keys ({told}" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in out.iterdir() if path.name != "log.txt"} == before
     tiny_prior(slots=6, seed=2).save(moved)
     assert main([*words, f"prior={moved}"]) == 0

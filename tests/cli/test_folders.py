@@ -55,6 +55,8 @@ def test_the_same_command_with_other_keys_is_refused_and_with_the_same_repeated(
     before = _contents(drawn / "out")
     assert main([*_words(drawn), "seed=1", f"output={drawn / 'out'}"]) == 2
     assert "seed was 0, is 1" in capsys.readouterr().err
+    assert main([*_words(drawn), "reward={name: clip, reward: object_count, high: 2}", f"output={drawn / 'out'}"]) == 2
+    assert "reward.name was None, is 'clip'" in capsys.readouterr().err
     assert main([*_words(drawn), f"output={drawn / 'out'}"]) == 0
     after = _contents(drawn / "out")
     assert {name for name in before if before[name] != after[name]} <= {"metrics.json"}  # holds seconds

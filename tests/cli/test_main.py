@@ -301,7 +301,7 @@ LINES = {
     "sample claim_guidance=2": "claim_guidance=2 guides scenes to the claims of a prompt",
     "search claim_guidance=2": "give prompt=, or leave claim_guidance=0",
     "rearrange prior=dimsum_table claim_guidance=-1": "claim_guidance=-1.0 must be a finite number",
-    "evaluate claim_guidance=nan": "claim_guidance=nan must be a finite number",
+    "evaluate claim_guidance=nan": "claim_guidance=nan must be at least 0",
     "sample physics_guidance=2": "physics_guidance=2.0 must be a number from 0 to 1",
     "search physics_guidance=-1": "physics_guidance=-1.0 must be a number from 0 to 1",
     "complete prior=dimsum_table physics_guidance=nan": "physics_guidance=nan must be a number from 0 to 1",
@@ -365,8 +365,9 @@ def test_the_names_that_are_known_without_torch_are_those_of_the_packages():
     assert len(own) > 15
     assert len(list_priors()) > 8
     code = (
-        "from agents.configuration.composition import known_masks, known_rewards, known_scenes\n"
-        "print([known_masks(), known_rewards(), known_scenes()])"
+        "from agents.configuration.composition import known_masks, known_rewards\n"
+        "from scene_envs import list_scene_types\n"
+        "print([known_masks(), known_rewards(), list_scene_types()])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     masks, rewards, scenes = ast.literal_eval(done.stdout)

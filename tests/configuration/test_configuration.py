@@ -192,6 +192,8 @@ def test_words_win_over_a_file(tmp_path: Path) -> None:
     found = compose("post-train", PostTrainConfig, words, config_file=source)
     assert (found.algorithm.name, found.seed, found.reward, found.optimizer.lr) == ("ddpo_sf", 3, "object_count", 0.5)
     assert found.iterations == settings.iterations
+    found = compose("post-train", PostTrainConfig, ["reward={name: mean, rewards: [clutter]}"], config_file=source)
+    assert found.reward == {"name": "mean", "rewards": ["clutter"]}  # nothing of the reward of the file
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -198,33 +197,6 @@ def test_a_second_writer_is_told_who_the_first_is(tmp_path):
         with claimed(tmp_path, "the second"), claimed(tmp_path, "the same process"):
             pass
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("age", [5, 3600])
-def test_a_lock_of_another_computer_holds_while_it_gives_signs_of_life(tmp_path, age):
-    lock = tmp_path / LOCK
-    lock.write_text("scene-envs pretrain, process 7 on elsewhere.example, since 2026-01-01 10:00:00")
-    os.utime(lock, (time.time() - age, time.time() - age))
-    if age > 60:
-        with claimed(tmp_path, "the second"):
-            assert "elsewhere" not in lock.read_text()
-        return
-    with pytest.raises(InvalidInputError, match=r"process 7 on elsewhere.example.* or remove '.*\.writer\.lock'"):
-        claimed(tmp_path, "the second").__enter__()
-    lock.unlink()  # as it was told
-    with claimed(tmp_path, "the second"):
-        pass
-
-
-def test_a_writer_gives_signs_of_life(tmp_path, monkeypatch):
-    monkeypatch.setattr("scene_envs.files._BEAT", 0.01)
-    with claimed(tmp_path, "the first"):
-        os.utime(tmp_path / LOCK, (0, 0))
-        for _ in range(500):
-            if (tmp_path / LOCK).stat().st_mtime > 0:
-                break
-            time.sleep(0.01)
-        assert (tmp_path / LOCK).stat().st_mtime > 0
 
 
 @pytest.mark.parametrize(

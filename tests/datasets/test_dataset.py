@@ -16,7 +16,7 @@ import torch
 
 from scene_envs.datasets import DatasetInfo, SceneDataset, describe_all, read_metadata, to_union
 from scene_envs.datasets.dataset import union_normalizer
-from scene_envs.errors import CorruptFileError, InvalidInputError, UnknownNameError
+from scene_envs.errors import CorruptFileError, InvalidInputError, StorageError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type, union_scene_type
@@ -31,7 +31,7 @@ def dataset() -> SceneDataset:
         low[constant] = high[constant] = 0.0
     low[11] = 0.0
     sets = describe_all(batch, np.random.default_rng(0))
-    return SceneDataset.from_sets(batch.tensor, sets, Normalizer.from_range(low, high), TYPE)
+    return SceneDataset(batch.tensor, sets, Normalizer.from_range(low, high), TYPE)
 
 
 @pytest.fixture
@@ -81,10 +81,16 @@ def test_a_dataset_with_one_prompt_per_scene_has_the_published_columns(dataset: 
     assert SceneDataset.load(tmp_path).prompt_sets == one.prompt_sets
 
 
-def test_prompt_sets_that_contradict_the_prompts_are_refused(dataset: SceneDataset) -> None:
-    sets = [("Something else.",)] * 40
-    with pytest.raises(InvalidInputError, match="prompt_sets"):
-        SceneDataset(dataset.tensor, dataset.prompts, dataset.normalizer, TYPE, {}, sets)
+@pytest.mark.parametrize("sets", [["A scene."] * 39, [()] * 40])
+def test_each_scene_needs_a_prompt(dataset: SceneDataset, sets: list[str]) -> None:
+    with pytest.raises(InvalidInputError, match="40 scenes need as many prompts"):
+        SceneDataset(dataset.tensor, sets, dataset.normalizer, TYPE)
+
+
+def test_a_folder_that_cannot_be_written_is_named(dataset: SceneDataset, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match=r"cannot write .*file/scenes"):
+        dataset.save(tmp_path / "file" / "scenes")
 
 
 def test_metadata_alone_tells_what_a_dataset_holds(folder: Path, dataset: SceneDataset) -> None:

@@ -18,7 +18,6 @@ from torchrl.envs.utils import check_env_specs
 import scene_envs.envs.spaces as env_spaces
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
-from scene_envs import registry as plugins
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.envs import DenoisingTorchRLEnv, SearchProblem
 from scene_envs.envs import scoring as resolvers
@@ -34,19 +33,6 @@ def test_unknown_names_offer_the_nearest() -> None:
         gym.make(ID, reward="feasible_object")
     with pytest.raises(UnknownNameError, match="did you mean 'dimsum_table'"):
         gym.make(ID, prior="dimsum_tabel")
-
-
-def test_entry_points_of_a_checkout_do_not_depend_on_installed_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An editable install keeps the metadata of the day it was made."""
-    monkeypatch.setattr(plugins, "_installed_entry_points", lambda group, places: {})
-    assert set(plugins.plugin_entry_points(resolvers.ENTRY_POINT_GROUP)) == {"prior", "reward"}
-
-
-def test_the_pyproject_of_another_project_is_not_ours(tmp_path: Path) -> None:
-    page = tmp_path / "pyproject.toml"
-    page.write_text('[project]\nname = "other"\n[project.entry-points."scene_envs.resolvers"]\nreward = "x:y"\n')
-    assert plugins._checkout_entry_points(page) == {}
-    assert plugins._checkout_entry_points(tmp_path / "missing.toml") == {}
 
 
 def test_without_a_resolver_the_error_says_how_to_get_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,13 +11,14 @@ from agents.evaluation.classifier import Accuracy, ClassifierConfig, classifier_
 from agents.evaluation.set_network import SetNetwork, SetNetworkConfig, blurred, scene_tokens
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
+from tests.helpers.fake_gpu import fake_gpu
 
 QUICK = ClassifierConfig(epochs=8, patience=4, batch_size=16)
 
 
 @pytest.fixture(scope="module")
 def scenes() -> SceneBatch:
-    return grammar_scenes("dimsum_table", 240, seed=4)
+    return grammar_scenes("dimsum_table", 160, seed=4)
 
 
 def lifted(batch: SceneBatch, by: float) -> SceneBatch:
@@ -39,14 +40,13 @@ def two_cups(distance: float) -> SceneBatch:
 
 @pytest.mark.slow
 def test_real_against_real_is_chance(scenes: SceneBatch) -> None:
-    accuracy = classifier_accuracy(scenes[:120], scenes[120:], seeds=2, config=QUICK)
-    assert accuracy.mean == pytest.approx(0.5, abs=0.13)  # 84 held-out scenes a seed: 5 % standard error
-    assert len(accuracy.per_seed) == 2
+    accuracy = classifier_accuracy(scenes[:80], scenes[80:], seeds=1, config=QUICK)
+    assert accuracy.mean == pytest.approx(0.5, abs=0.27)  # 56 held-out scenes: 7 % standard error
 
 
 @pytest.mark.slow
 def test_scenes_five_millimetres_too_high_are_found_out(scenes: SceneBatch) -> None:
-    accuracy = classifier_accuracy(scenes[:120], lifted(scenes[120:], 5e-3), seeds=1, config=QUICK)
+    accuracy = classifier_accuracy(scenes[:80], lifted(scenes[80:], 5e-3), seeds=1, config=QUICK)
     assert accuracy.mean > 0.9
 
 
@@ -57,7 +57,15 @@ def test_the_same_seed_gives_the_same_accuracy_and_leaves_torch_alone(scenes: Sc
     short = ClassifierConfig(epochs=1)
     first, again = (classifier_accuracy(scenes[:40], scenes[40:80], seeds=2, config=short) for _ in range(2))
     assert first == again
+    assert len(first.per_seed) == 2
     assert torch.equal(torch.rand(3), expected)
+
+
+def test_scenes_of_two_devices_are_compared(scenes: SceneBatch, monkeypatch: pytest.MonkeyPatch) -> None:
+    short = ClassifierConfig(epochs=1)
+    expected = classifier_accuracy(scenes[:24], scenes[24:48], seeds=1, config=short)
+    with fake_gpu(monkeypatch):
+        assert classifier_accuracy(scenes[:24], scenes[24:48].to("cuda"), seeds=1, config=short) == expected
 
 
 def test_accuracy_summarises_its_seeds() -> None:
@@ -125,7 +133,7 @@ def test_bad_input_is_refused(scenes: SceneBatch) -> None:
     other = SceneBatch.empty("pantry_shelf", 30)
     with pytest.raises(InvalidInputError, match="'dimsum_table' cannot be compared with scenes of 'pantry_shelf'"):
         classifier_accuracy(scenes, other)
-    with pytest.raises(InvalidInputError, match="at least 20 real scenes and samples each, got 240 and 3"):
+    with pytest.raises(InvalidInputError, match="at least 20 real scenes and samples each, got 160 and 3"):
         classifier_accuracy(scenes, scenes[:3])
     with pytest.raises(InvalidInputError, match="seeds must be at least 1"):
         classifier_accuracy(scenes, scenes, seeds=0)

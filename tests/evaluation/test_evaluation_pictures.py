@@ -20,7 +20,7 @@ from agents.evaluation.pictures import (
     render_classifier_accuracy,
 )
 from agents.evaluation.set_network import SHIPPED, SetEncoder, blurred
-from benchmarks.set_encoder_training import SetEncoderTraining, damage, train_set_encoder
+from benchmarks.set_encoder_training import damage
 from scene_envs.datasets import to_union
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.render import observe
@@ -156,15 +156,13 @@ def test_damage_says_what_it_did(real: SceneBatch) -> None:
     assert float((shift / sigma[:, None]).std()) == pytest.approx(1.0, abs=0.05)
 
 
-def test_training_is_reproducible_and_a_file_brings_it_back(tmp_path: Path, real: SceneBatch) -> None:
-    config = SetEncoderTraining(scenes=8, steps=3, batch_size=4)
-    first, again = (
-        train_set_encoder(1, config, scene_types=["dimsum_table"], scenes={"dimsum_table": real}) for _ in range(2)
-    )
-    expected = first.features(real[:5])
-    assert torch.equal(expected, again.features(real[:5]))
-    loaded = SetEncoder.load(first.save(tmp_path / "encoder.safetensors"))
-    assert torch.allclose(loaded.features(real[:5]), expected, atol=0.05)
+def test_a_file_brings_an_encoder_back(tmp_path: Path, real: SceneBatch) -> None:
+    """Weights are kept in half precision."""
+    torch.manual_seed(0)
+    encoder = SetEncoder(("cafe_table", "teacup", "teapot"))
+    loaded = SetEncoder.load(encoder.save(tmp_path / "encoder.safetensors"))
+    assert loaded.vocabulary == encoder.vocabulary
+    assert torch.allclose(loaded.features(real[:5]), encoder.features(real[:5]), atol=0.05)
     assert frechet_scene_distance(real[:20], real[20:40], encoder=loaded) > 0
 
 

@@ -14,12 +14,12 @@ from agents.evaluation import evaluate, figure_table, grammar_scenes, measure_sa
 from agents.evaluation.measure import MEASURES, EvaluationInputs, RealScenes, compute_measure
 from agents.evaluation.physics_figures import stability_figures
 from agents.priors.testing import tiny_prior
-from scene_envs.datasets import SceneDataset, generate
+from scene_envs.datasets import SceneDataset
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.normalizer import Normalizer
 from scene_envs.physics import feasibility
 from scene_envs.scene import SceneBatch
-from scene_envs.scene_types import get_scene_type, register_scene_type, union_scene_type
+from scene_envs.scene_types import get_scene_type, union_scene_type
 from tests.helpers.built_scenes import build
 
 
@@ -92,13 +92,13 @@ def test_the_deep_ones_are_counted_apart(real: SceneBatch) -> None:
 
 
 def test_rooms_whose_tables_overlap_are_counted(real: SceneBatch) -> None:
-    rooms = grammar_scenes("restaurant_low_clutter", 4, seed=1)
+    rooms = grammar_scenes("restaurant_low_clutter", 2, seed=1)
     assert measure_samples(rooms, rooms, ready=False)["furniture_collision_rate"] == 0.0
-    first, second = rooms.is_furniture[2].nonzero().flatten()[:2].tolist()
+    first, second = rooms.is_furniture[1].nonzero().flatten()[:2].tolist()
     translations, rotations = rooms.translations.clone(), rooms.rotations.clone()
-    translations[2, second], rotations[2, second] = translations[2, first] + 0.05, rotations[2, first]
+    translations[1, second], rotations[1, second] = translations[1, first] + 0.05, rotations[1, first]
     joined = measure_samples(rooms.with_poses(translations, rotations), rooms, ready=False)
-    assert joined["furniture_collision_rate"] == 0.25
+    assert joined["furniture_collision_rate"] == 0.5
     assert "furniture_collision_rate" not in measure_samples(real, real, ready=False)
 
 
@@ -265,13 +265,15 @@ def test_held_out_scenes_may_be_a_folder_of_their_own(scenes: SceneBatch, tmp_pa
 
 
 @pytest.mark.slow
-def test_a_union_takes_as_many_scenes_of_each_of_its_types(scenes: SceneBatch, tmp_path: Path) -> None:
+def test_a_union_takes_as_many_scenes_of_each_of_its_types_in_turn(scenes: SceneBatch, tmp_path: Path) -> None:
     shelves = grammar_scenes("pantry_shelf", 12, seed=6)
     union = union_scene_type(["dimsum_table", "pantry_shelf"])
     folders = f"{save(scenes, tmp_path / 'a')},{save(shelves, tmp_path / 'b')}"
     real = RealScenes.load(union, 6, data=folders)
     assert real.reference.scene_type.name == "dimsum_table+pantry_shelf"
-    assert sorted("cafe_table" in names for names in real.reference.names()) == [False] * 3 + [True] * 3
+    on_table = ["cafe_table" in names for names in real.reference.names()]
+    assert sum(on_table) == 3
+    assert sum(on_table[:4]) == 2  # in turn, so that the first scenes are of all types
 
 
 def test_too_few_held_out_scenes_are_refused(scenes: SceneBatch, tmp_path: Path) -> None:
@@ -286,16 +288,4 @@ def test_the_grammar_gives_two_different_sets() -> None:
 
 
 def test_a_list_that_holds_all_is_all() -> None:
-    assert choose_measures("all,layout") == choose_measures(["layout", "all"]) == choose_measures("all")
-
-
-@pytest.mark.slow
-def test_the_first_real_scenes_of_a_union_are_of_all_its_types(tmp_path: Path) -> None:
-    for scene in ("dimsum_table", "pantry_shelf"):
-        generate(scene, 16, tmp_path / scene, workers=0, verify=False, progress=False)
-    union = register_scene_type(union_scene_type([get_scene_type(name) for name in ("dimsum_table", "pantry_shelf")]))
-    real = RealScenes.load(union, 8, data=f"{tmp_path / 'dimsum_table'},{tmp_path / 'pantry_shelf'}")
-    shelf = union.assets.index("shelf")
-    for batch in (real.reference, real.floor):
-        assert (batch.categories[:4] == shelf).any(dim=1).sum() == 2
-        assert (batch.categories == shelf).any(dim=1).sum() == len(batch) / 2
+    assert choose_measures(["layout", "all"]) == choose_measures("all")

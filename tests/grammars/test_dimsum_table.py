@@ -17,7 +17,7 @@ NAMES = np.array([*SCENE_TYPE.assets, ""])
 
 @pytest.fixture(scope="module")
 def scenes() -> NDArray[np.float32]:
-    return get_grammar("dimsum_table").sample_array(np.random.default_rng(1), 600)
+    return get_grammar("dimsum_table").sample_array(np.random.default_rng(1), 300)
 
 
 def _present(scene: NDArray[np.float32]) -> tuple[NDArray[np.str_], NDArray[np.float32], NDArray[np.float32]]:
@@ -67,7 +67,7 @@ def test_heights_are_exactly_zero_or_levels_of_a_stack(scenes: NDArray[np.float3
 
 
 def test_a_lid_ends_its_stack(scenes: NDArray[np.float32]) -> None:
-    for scene in scenes[:500]:
+    for scene in scenes:
         names, positions, _ = _present(scene)
         for lid in positions[names == "steamer_lid"]:
             column = positions[(positions[:, :2] == lid[:2]).all(axis=1)]
@@ -76,7 +76,7 @@ def test_a_lid_ends_its_stack(scenes: NDArray[np.float32]) -> None:
 
 
 def test_objects_stay_on_the_table_and_out_of_each_others_circles(scenes: NDArray[np.float32]) -> None:
-    for scene in scenes[:500]:
+    for scene in scenes:
         names, positions, _ = _present(scene)
         standing = (positions[:, 2] == 0) & (names != "cafe_table")
         points, radii = positions[standing, :2].astype(float), np.array([KEEP_OUT[n] for n in names[standing]])
@@ -98,8 +98,8 @@ def test_assets_fit_in_their_circles() -> None:
 
 def test_counts_follow_the_published_statistics(scenes: NDArray[np.float32]) -> None:
     counts = (scenes[..., -1] == 0).sum(axis=1)
-    # 1,500 scenes: the standard error of the mean is 0.09, so 3 % of 18.14 (0.54) is six of them.
-    assert counts.mean() == pytest.approx(18.14, rel=0.03)
+    # 300 scenes: the standard error of the mean is 0.2, so 5 % of 18.14 (0.9) is four of them.
+    assert counts.mean() == pytest.approx(18.14, rel=0.05)
     assert counts.min() >= 7
     assert counts.max() <= 34
 

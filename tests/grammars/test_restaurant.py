@@ -17,7 +17,6 @@ from scene_envs.grammars.layout import Containers
 from scene_envs.grammars.restaurant import stack_of_three, tables
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type
-from tests.helpers.drawn_scenes import check_reproducible
 
 PAPER = {"restaurant_high_clutter": (60.54, 33, 125), "restaurant_low_clutter": (35.08, 9, 107)}
 """Mean, smallest and largest number of objects in the paper's datasets, the floor included."""
@@ -64,7 +63,7 @@ def batch(kind: str) -> SceneBatch:
     with pytest.MonkeyPatch.context() as patch:
         still = lambda self, container, contents, *rest: [(np.eye(3), np.zeros(3))] * len(contents)  # noqa: E731
         patch.setattr(Containers, "fill", still)
-        return get_grammar(kind).sample(np.random.default_rng(1), 120)
+        return get_grammar(kind).sample(np.random.default_rng(1), 50)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +120,7 @@ def test_people_can_pass_between_chairs(rooms: list[Room]) -> None:
 
 
 def test_shelves_stand_on_the_floor_along_the_wall_open_to_the_room(rooms: list[Room]) -> None:
-    assert sum((room.names == "shelf").any() for room in rooms) > 50
+    assert sum((room.names == "shelf").any() for room in rooms) > 20
     for room in rooms:
         shelves = room.all("shelf")
         np.testing.assert_allclose(shelves[:, 0], -4.75, atol=1e-6)
@@ -166,21 +165,17 @@ def test_the_number_of_tables_keeps_its_weights_whatever_the_condition_rejects()
 
 @pytest.mark.slow
 def test_counts_follow_the_published_statistics(kind: str) -> None:
-    """4 standard errors of the mean of 1,500 structures are 2.6 % (high) and 4.5 % (low) of the published mean."""
+    """4 standard errors of the mean of 600 structures are 4 % (high) and 7 % (low) of the published mean."""
     mean, low, high = PAPER[kind]
     grammar, rng = get_grammar(kind), np.random.default_rng(3)
     counts = []
-    while len(counts) < 1500:
+    while len(counts) < 600:
         towers = grammar.surfaces[0].draw(rng, grammar.reasons)
         count = 1 + sum(len(part.assets) + len(part.contents) for tower in towers for part in tower.walk())
         parts = [part for tower in towers for part in tower.walk()]
         if count <= high and all(holds(parts) for holds in grammar.such_that.values()):
             counts.append(count)
-    assert np.mean(counts) == pytest.approx(mean, rel=0.03 if "high" in kind else 0.045)
+    assert np.mean(counts) == pytest.approx(mean, rel=0.04 if "high" in kind else 0.07)
     assert min(counts) >= low
     assert max(counts) > 0.8 * high
     assert get_scene_type(kind).slots == high
-
-
-def test_the_same_seed_gives_the_same_scenes(kind: str) -> None:
-    check_reproducible(kind)

@@ -123,9 +123,9 @@ def test_a_composite_with_foreign_parts_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_parts_of_a_composite_that_learn_are_found() -> None:
-    gate = {"name": "gate", "reward": "discriminator", "condition": "feasible_share", "threshold": 0.5}
+    total = {"name": "weighted_sum", "rewards": ["feasible_share", "discriminator"]}
     clip = {"name": "clip", "reward": {"name": "product", "rewards": ["discriminator"]}, "high": 1.0}
-    reward = resolve_reward({"name": "weighted_sum", "rewards": [gate, "object_count", clip]})
+    reward = resolve_reward({"name": "weighted_sum", "rewards": [total, "object_count", clip]})
     assert [type(part) for part in learned_parts(reward)] == [Discriminator, Discriminator]
 
 

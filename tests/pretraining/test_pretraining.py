@@ -90,12 +90,12 @@ def test_nan_stops_the_run_and_keeps_the_last_checkpoint(config: PretrainConfig,
 def test_a_run_does_not_go_on_with_keys_that_do_not_fit_it(config: PretrainConfig, raw: torch.Tensor) -> None:
     make_run(config, raw).run()
     for other, was in (
-        ({"optimizer.name": "adamw"}, "optimizer.name=muon"),
-        ({"network.hidden": 32}, "network.hidden=16"),
-        ({"seed": 7}, "seed="),
-        ({"optimizer.lr": 0.5}, "optimizer.lr="),
+        ({"optimizer.name": "adamw"}, "optimizer.name was 'muon'"),
+        ({"network.hidden": 32}, "network.hidden was 16"),
+        ({"seed": 7}, "seed was"),
+        ({"optimizer.lr": 0.5}, "optimizer.lr was"),
     ):
-        with pytest.raises(InvalidInputError, match=f"started with {was}"):
+        with pytest.raises(InvalidInputError, match=was):
             make_run(changed(config, {"iterations": 8, **other}), raw).run()
 
 

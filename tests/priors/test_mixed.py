@@ -528,7 +528,7 @@ def no_other_bert(monkeypatch: pytest.MonkeyPatch) -> None:
 def _data() -> SceneDataset:
     scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 24)
     prompts = describe_all(scenes, np.random.default_rng(0))
-    return SceneDataset.from_sets(scenes.tensor, prompts, Normalizer.fit(scenes.tensor), scenes.scene_type)
+    return SceneDataset(scenes.tensor, prompts, Normalizer.fit(scenes.tensor), scenes.scene_type)
 
 
 @pytest.fixture(scope="module")

@@ -144,7 +144,7 @@ def good_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tiny_prior(process="continuous").save(path / "plain")
     scenes = get_grammar("dimsum_table").sample(np.random.default_rng(0), 12)
     prompts = describe_all(scenes, np.random.default_rng(0))
-    data = SceneDataset.from_sets(scenes.tensor, prompts, Normalizer.fit(scenes.tensor), scenes.scene_type)
+    data = SceneDataset(scenes.tensor, prompts, Normalizer.fit(scenes.tensor), scenes.scene_type)
     data.save(path / "data")
     scenes[:2].save(path / "scenes.safetensors")
     return path

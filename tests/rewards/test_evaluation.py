@@ -5,7 +5,8 @@ import logging
 import pytest
 import torch
 
-from rewards import RewardContext, RewardOutput, check_reward, evaluate_reward
+from rewards import RewardContext, RewardOutput, check_reward, evaluate_reward, resolve_reward
+from scene_envs import SceneBatch
 from scene_envs.errors import RewardError
 
 
@@ -50,6 +51,15 @@ def test_a_broken_reward_is_invalid_or_an_error_when_strict(message, cups, caplo
 def test_values_that_are_not_finite_make_their_own_row_invalid(cups):
     output = evaluate_reward(lambda b, c: torch.tensor([1.0, torch.inf]), cups)
     assert output.valid.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("reward", ["object_count", lambda batch: batch.counts])
+def test_scenes_of_inference_mode_are_scored(reward, cups):
+    with torch.inference_mode():
+        scenes = SceneBatch(cups.tensor.clone(), cups.scene_type)
+    assert evaluate_reward(resolve_reward(reward), scenes).value.tolist() == [4.0, 2.0]
+    with pytest.raises(RewardError, match="changed the scenes"):
+        evaluate_reward(BROKEN["changed the scenes"], scenes, strict=True)
 
 
 def test_gradients_stop_at_a_reward_and_numbers_become_float32(cups):

@@ -17,7 +17,6 @@ from rewards import (
     Clearance,
     Clutter,
     Diversity,
-    Gate,
     Penetration,
     RewardContext,
     RewardOutput,
@@ -30,7 +29,7 @@ from rewards import (
 from scene_envs import SceneBatch, get_grammar, get_scene_type
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
-COMPOSITES = {"clip", "gate", "product", "weighted_sum"}
+COMPOSITES = {"clip", "product", "weighted_sum"}
 SHELF = [
     "clearance",
     "clutter",
@@ -241,7 +240,6 @@ def test_diversity_is_the_mean_distance_to_the_others() -> None:
 def test_composites_depend_on_the_batch_when_a_part_does() -> None:
     assert WeightedSum(["object_count", "diversity"]).depends_on_batch
     assert not WeightedSum(["object_count", "clutter"]).depends_on_batch
-    assert Gate("object_count", condition="diversity", threshold=0.0).depends_on_batch
     assert len(check_reward({"name": "weighted_sum", "rewards": ["object_count", "diversity"]})) == 5
 
 

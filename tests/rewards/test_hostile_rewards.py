@@ -116,7 +116,7 @@ def test_a_part_of_a_composite_is_named_once(cups):
 def test_rewards_of_this_package_and_objects_stay_in_this_process():
     assert not is_foreign("object_count")
     assert not is_foreign({"name": "weighted_sum", "rewards": ["object_count", {"name": "clutter"}]})
-    assert is_foreign({"name": "gate", "reward": "object_count", "condition": "mine.py:good", "threshold": 1.0})
+    assert is_foreign({"name": "product", "rewards": ["object_count", "mine.py:good"]})
     assert is_foreign({"_target_": "my_package.Mine"})
     assert run_reward("object_count") == resolve_reward("object_count")
 

@@ -8,16 +8,16 @@ from rewards import (
     Clip,
     FeasibleObjects,
     FeasibleShare,
-    Gate,
     ObjectCount,
     Product,
     RewardContext,
     RewardOutput,
     WeightedSum,
     evaluate_reward,
+    facts_of,
     resolve_reward,
 )
-from rewards.base import averages_objects, declared_maximum
+from rewards.base import declared_maximum
 from rewards.process import run_reward
 from scene_envs import SceneBatch
 from scene_envs.errors import InvalidInputError
@@ -54,12 +54,8 @@ def test_weighted_sum_adds_values_credits_and_names_its_terms(cups):
     assert score(WeightedSum(["object_count", half_invalid]), cups).per_object is None
 
 
-def test_product_gate_and_clip(cups):
+def test_product_and_clip(cups):
     assert score(Product(["object_count", "object_count"]), cups).value.tolist() == [16.0, 4.0]
-    gated = score(Gate(distances, condition="object_count", threshold=4.0, otherwise=-1.0), cups)
-    torch.testing.assert_close(gated.value, torch.tensor([0.6, -1.0]))
-    assert gated.terms["gate_open"].tolist() == [1.0, 0.0]
-    assert gated.per_object[1].abs().sum() == 0
     clipped = score(Clip("object_count", low=3.0, high=3.5), cups)
     assert clipped.value.tolist() == [3.5, 3.0]
     assert clipped.per_object.abs().sum() == 0
@@ -193,14 +189,27 @@ def test_the_largest_value_is_declared(reward, largest):
         ("reachability", True),
         ("clearance", True),
         ({"name": "clip", "reward": "feasible_share", "low": 0.5}, True),
-        ({"name": "gate", "reward": "feasible_share", "condition": "object_count", "threshold": 3}, True),
         ({"name": "weighted_sum", "rewards": ["feasible_share", "stability"]}, True),
         ({"name": "weighted_sum", "rewards": ["feasible_share", "object_count"]}, False),
         (lambda batch: batch.counts, False),
     ],
 )
 def test_means_over_objects_say_so(reward, averages):
-    assert averages_objects(resolve_reward(reward)) == averages
+    assert facts_of(resolve_reward(reward))["averages_objects"] == averages
+
+
+@pytest.mark.parametrize(
+    "reward",
+    [
+        {"name": "weighted_sum", "rewards": ["object_count", "prompt_match"]},
+        {"name": "product", "rewards": ["object_count", "prompt_match"]},
+        {"name": "clip", "reward": "prompt_match", "high": 0.5},
+    ],
+)
+def test_a_composite_needs_prompts_when_a_part_does(reward):
+    assert facts_of(resolve_reward(reward))["needs_prompts"]
+    fixed = repr(reward).replace("'prompt_match'", "{'name': 'prompt_match', 'prompt': 'A scene with a cup.'}")
+    assert not facts_of(resolve_reward(eval(fixed)))["needs_prompts"]
 
 
 def test_a_function_declares_its_largest_value_by_an_attribute():

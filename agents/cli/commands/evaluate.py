@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior
 from agents.cli.run_folder import Run
-from agents.configuration.composition import MEASURE_NAMES, DrawKeys, OutputKeys
+from agents.configuration.composition import MEASURE_NAMES, DrawKeys, OutputKeys, check_same_keys
 from scene_envs.errors import (
+    FINITE,
     CorruptFileError,
     Count,
     InvalidInputError,
@@ -35,27 +36,15 @@ _OF_PROMPTS = {"prompt_count", "guidance", "claim_guidance"}
 
 
 @dataclass
-class RealSceneKeys:
-    """Real scenes to compare with.
-
-    Attributes:
-        data: dataset folder on which the prior was trained; several, joined by commas, for a prior of several scene
-            types. Empty compares with fresh scenes of the grammar and leaves out novelty.
-        heldout: dataset folder of held-out scenes; empty takes the last scenes of data.
-        training_scenes: number of random scenes of data among which novelty looks for the nearest.
-    """
-
-    data: str = ""
-    heldout: str = ""
-    training_scenes: Count = 20_000
-
-
-@dataclass
-class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
+class EvaluateConfig(DrawKeys, OutputKeys):
     """Measures of a prior's raw samples, each beside that of real scenes.
 
     Attributes:
         prior: a shipped name, or the folder of a prior or a run.
+        data: dataset folder on which the prior was trained; several, joined by commas, for a prior of several scene
+            types. Empty compares with fresh scenes of the grammar and leaves out novelty.
+        heldout: dataset folder of held-out scenes; empty takes the last scenes of data.
+        training_scenes: number of random scenes of data among which novelty looks for the nearest.
         count: number of samples, and of real scenes in each of the two sets for comparison.
         prompt_count: number of samples with prompts of held-out scenes, at most count; null takes count.
         guidance: weight of classifier-free guidance for the samples with prompts, 0 for none.
@@ -71,33 +60,32 @@ class EvaluateConfig(RealSceneKeys, DrawKeys, OutputKeys):
     """
 
     prior: str = "dimsum_table"
+    data: str = ""
+    heldout: str = ""
+    training_scenes: Count = 20_000
     count: Annotated[int, at_least(2)] = 200
     prompt_count: int | None = None
-    guidance: float = 0.0
-    claim_guidance: float = 0.0
+    guidance: Annotated[float, FINITE] = 0.0
+    claim_guidance: Annotated[float, at_least(0)] = 0.0
     measures: Any = "all"
     project: bool = True
     pictures: Natural = 16
 
 
 def choose_measures(measures: str | Iterable[str], *, project: bool = True) -> list[str]:
-    """Names of groups, in their order, from ``"all"``, a name, names joined by commas, or a list of names; ``project``
-    says whether ``"all"`` includes ``ready``. An UnknownNameError for a name that is no group.
+    """Names of groups, in their order, from ``"all"``, a name, or a list of names; ``project`` says whether ``"all"``
+    includes ``ready``. An UnknownNameError for a name that is no group.
 
-    >>> choose_measures("novelty, layout")
+    >>> choose_measures(["novelty", "layout"])
     ['layout', 'novelty']
     """
-    if not isinstance(measures, str | Iterable):
+    names = [measures] if isinstance(measures, str) else measures
+    if not isinstance(names, Iterable) or not names:
         raise InvalidInputError(f"measures={measures!r} is no list of names; known: all, {', '.join(MEASURE_NAMES)}")
-    names = [name.strip() for name in measures.split(",")] if isinstance(measures, str) else [*map(str, measures)]
-    if "all" in names and all(name == "all" or name in MEASURE_NAMES for name in names):
-        return [name for name in MEASURE_NAMES if project or name != "ready"]
-    if not names:
-        raise InvalidInputError(f"measures is empty; give all, or some of {', '.join(MEASURE_NAMES)}")
     for name in names:
-        if name not in MEASURE_NAMES:
-            raise unknown_name("measure", name, ["all", *MEASURE_NAMES])
-    return [name for name in MEASURE_NAMES if name in names]
+        if name not in ("all", *MEASURE_NAMES):
+            raise unknown_name("measure", str(name), ["all", *MEASURE_NAMES])
+    return [name for name in MEASURE_NAMES if name in names or ("all" in names and (project or name != "ready"))]
 
 
 def check(settings: EvaluateConfig) -> None:
@@ -137,8 +125,7 @@ def run(settings: EvaluateConfig, run: Run) -> None:
         run.log(results.notes[-1])
     samples = results.scenes(_SAMPLES, lambda: draw(prior, settings, settings.count, batch_size=settings.batch_size))
     draw_scenes(samples, settings.pictures, run, "gallery.png")
-    asked = settings.measures.split(",") if isinstance(settings.measures, str) else settings.measures
-    optional = "all" in [str(name).strip() for name in asked]
+    optional = settings.measures == "all" or "all" in settings.measures
     with make_pool(settings.workers, physics=settings.physics) as pool:
         inputs = EvaluationInputs(
             samples,
@@ -210,16 +197,11 @@ class _Results:
         changed = {key for key in {*known, *identity} if known.get(key) != identity.get(key)}
         if not changed:
             return
-        stale = [_PROMPTED] if changed & _OF_PROMPTS else []
+        check_same_keys(run.directory, known, identity, ("digest", *_OF_PROMPTS))
+        stale = [_PROMPTED]
         if known and changed <= _OF_PROMPTS:
-            if stale and self.groups.pop("prompts", None) is not None:
-                run.say(f"{path} has other {' and '.join(sorted(changed & _OF_PROMPTS))}: measuring the prompts anew")
-        elif known and changed != {"digest"}:
-            told = [f"{key} was {known.get(key)!r}, is {identity.get(key)!r}" for key in sorted(changed - {"digest"})]
-            raise InvalidInputError(
-                f"output={str(run.directory)!r} holds figures of other keys ({'; '.join(told)[:500]}); give another "
-                "output"
-            )
+            if self.groups.pop("prompts", None) is not None:
+                run.say(f"{path} has other {' and '.join(sorted(changed))}: measuring the prompts anew")
         else:
             self.groups, stale = {}, [_SAMPLES, _PROMPTED]
             if known:

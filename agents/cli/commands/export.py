@@ -103,7 +103,6 @@ def run(settings: ExportConfig, run: Run) -> None:
     """Read or draw the scenes and write them."""
     from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import make_pool
-    from scene_envs.scene import SceneBatch
 
     formats = resolve_formats(settings.formats)
     batch = _scenes(settings, run)
@@ -111,8 +110,7 @@ def run(settings: ExportConfig, run: Run) -> None:
     metrics: dict[str, Any] = {}
     with make_pool(settings.workers, physics=settings.physics) as pool:
         if settings.project:
-            metrics["ready"] = make_ready(batch, 0, pool, run)
-            batch = SceneBatch.load(run.directory / "ready.safetensors")
+            batch, metrics["ready"] = make_ready(batch, 0, pool, run)
         metrics |= export_scenes(batch, formats, run.directory, pool, run, **keys)
     run.write_metrics(metrics)
 
@@ -193,7 +191,7 @@ def run_project(settings: ProjectConfig, run: Run) -> None:
     batch = load_scenes(Path(settings.scenes), settings.count)
     with make_pool(settings.workers, physics=settings.physics) as pool:
         draw_scenes(batch, settings.pictures, run, "before.png")
-        run.write_metrics({"scenes": len(batch), "ready": make_ready(batch, settings.pictures, pool, run)})
+        run.write_metrics({"scenes": len(batch), "ready": make_ready(batch, settings.pictures, pool, run)[1]})
     run.say(f"written to {run.directory}")
 
 

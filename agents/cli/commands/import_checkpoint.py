@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from typing import Any
 
-from agents.cli.commands.scenes import check_files
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DeviceKeys, named
 from scene_envs.arrays import resolve_device
@@ -47,7 +47,9 @@ def check(settings: ImportCheckpointConfig) -> None:
     """Refuse files that are not there."""
     if not settings.checkpoint or not settings.metadata:
         raise InvalidInputError("name the two files: scene-envs import-checkpoint FILE metadata.json")
-    check_files(settings.checkpoint, settings.metadata)
+    for path in (settings.checkpoint, settings.metadata):
+        if not os.path.isfile(path):
+            raise InvalidInputError(f"{path[:200]!r} is no file; name one that is there")
 
 
 def run(settings: ImportCheckpointConfig, run: Run) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Annotated, ClassVar
 
+from agents.configuration.composition import PhysicsGuidance
 from scene_envs.errors import Checked, InvalidInputError, OneOf
 
 WRITES = False
@@ -69,7 +70,7 @@ class PackagePriorConfig(Checked):
     license: str = ""
     machine: str = ""
     limits: str = ""
-    physics_guidance: float | None = None
+    physics_guidance: PhysicsGuidance | None = None
 
 
 def check_package_prior(settings: PackagePriorConfig) -> None:

@@ -71,7 +71,6 @@ def run(settings: SampleConfig, run: Run) -> None:
     from scene_envs.envs.scoring import RewardScorer
     from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import make_pool
-    from scene_envs.scene import SceneBatch
 
     formats = None if settings.export is None else resolve_formats(settings.export)
     reward = None
@@ -120,8 +119,7 @@ def run(settings: SampleConfig, run: Run) -> None:
             close_reward(reward)
         draw_scenes(batch, settings.pictures, run, "gallery.png")
         if settings.project:
-            metrics["ready"] = make_ready(batch, settings.pictures, pool, run)
-            batch = SceneBatch.load(run.directory / "ready.safetensors")
+            batch, metrics["ready"] = make_ready(batch, settings.pictures, pool, run)
         keys = {"randomization": settings.randomization}
         if formats is not None:
             if settings.verify:

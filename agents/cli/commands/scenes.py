@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Any
 
 from agents.cli.run_folder import Run
 from agents.configuration.composition import DrawKeys
 from scene_envs.arrays import resolve_device
-from scene_envs.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from agents.priors.prior import ScenePrior
     from scene_envs.physics import PhysicsPool
     from scene_envs.scene import SceneBatch
-
-_TILE = (400, 300)
-
-
-def check_files(*paths: str) -> None:
-    """Refuse paths at which there is no file."""
-    for path in paths:
-        if not os.path.isfile(path):
-            raise InvalidInputError(f"{path[:200]!r} is no file; name one that is there")
 
 
 def load_prior(settings: Any) -> ScenePrior:
@@ -63,8 +52,10 @@ def reward_figures(
     return figures
 
 
-def make_ready(batch: SceneBatch, pictures: int, pool: PhysicsPool | None, run: Run) -> dict[str, Any]:
-    """Project and settle the scenes into ``ready.safetensors`` and ``ready.png``; returns the figures."""
+def make_ready(
+    batch: SceneBatch, pictures: int, pool: PhysicsPool | None, run: Run
+) -> tuple[SceneBatch, dict[str, Any]]:
+    """Project and settle the scenes into ``ready.safetensors`` and ``ready.png``; returns them, and the figures."""
     from scene_envs import physics
 
     result = physics.make_ready(batch, pool=pool)
@@ -83,7 +74,7 @@ def make_ready(batch: SceneBatch, pictures: int, pool: PhysicsPool | None, run: 
         for ready, total in zip(result.counts, batch.is_free.sum(dim=-1), strict=True)
     ]
     draw_scenes(result.batch, pictures, run, "ready.png", captions)
-    return figures
+    return result.batch, figures
 
 
 def draw_scenes(batch: SceneBatch, count: int, run: Run, name: str, captions: list[str] | None = None) -> None:
@@ -97,5 +88,5 @@ def draw_scenes(batch: SceneBatch, count: int, run: Run, name: str, captions: li
     shown = batch[: min(count, len(batch))]
     if captions is None:
         captions = [f"{int(objects)} objects" for objects in shown.counts]
-    images = render(shown, width=_TILE[0], height=_TILE[1])
+    images = render(shown, width=400, height=300)
     gallery(list(images), columns=4, captions=captions[: len(shown)]).save(run.directory / name)

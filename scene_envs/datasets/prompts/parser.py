@@ -230,7 +230,7 @@ class _Reader:
         return Place(self.reference(placed=False), tier)
 
     def number(self) -> int:
-        digits = re.match(r"\d+\b", self.rest)
+        digits = re.match(r"\d{1,9}\b", self.rest)
         if digits:
             self.rest = self.rest[digits.end() :].lstrip()
             return int(digits.group())
