@@ -1,11 +1,11 @@
-"""Two planners that a user adds to ``scene-envs search``: UCT, and a tree over the steps of the denoising.
+"""Planners that a user adds to ``scene-envs search``: UCT, a tree over the steps of the denoising, Feynman-Kac.
 
-    python examples/planners.py planner=uct prior=dimsum_table objective=feasible_objects output=runs/uct
+    scene-envs search planner=./examples/planners.py:uct prior=dimsum_table output=runs/uct
 
-All keys of ``search`` are accepted; those of the planners are the attributes of the two dataclasses. Neither planner is
-ahead of ``greedy`` at equal numbers of scenes (benchmarks/search.md), so the package has neither. They show how a
-planner uses the :class:`~agents.planning.SearchBudget` of a plan, which spends the budget and keeps the best state,
-and how one steers the denoising itself.
+``python examples/planners.py planner=uct ...`` is the same command. All keys of ``search`` are accepted; those of the
+planners are the attributes of the dataclasses. None of them is ahead in a table of benchmarks/search.md, so the package
+has none of them. They show how a planner uses the :class:`~agents.planning.SearchBudget` of a plan, which spends the
+budget and keeps the best state, and two ways in which a planner steers the denoising itself.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from agents.cli import main
-from agents.planning import PlannerSettings, PlanResult, Searchable, SearchBudget, register_planner
+from agents.planning import GreedyPlanner, PlannerSettings, PlanResult, Searchable, SearchBudget, register_planner
 from agents.planning.ledger import Candidate, Progress, SteeredProblem
 from scene_envs import SceneBatch
-from scene_envs.errors import Count, InvalidInputError, at_least
+from scene_envs.errors import BELOW_ONE, Count, InvalidInputError, at_least
 
 
 @dataclass(eq=False)
@@ -288,6 +289,104 @@ class TreeOverStepsPlanner(PlannerSettings):
         """The steering of scenes that continue from ``node``."""
         x = None if node.x is None else node.x.expand(len(pairs), *node.x.shape)
         return Branches(self.stops, node.level, x, values)
+
+
+def systematic(weights: np.ndarray, uniform: float) -> np.ndarray:
+    """(K,) index of the particle that each place continues with: systematic resampling (Carpenter et al. 1999). A
+    particle with share w_i of the sum of the weights (K,) gets K w_i places on average over ``uniform`` in [0, 1), and
+    always K w_i rounded down or up. A particle that gets any place keeps its own.
+    """
+    count = len(weights)
+    edges = np.cumsum(weights)
+    drawn = np.searchsorted(edges / edges[-1], (np.arange(count) + uniform) / count, side="right").clip(max=count - 1)
+    rows = np.full(count, -1)
+    survivors, repeats = np.unique(drawn, return_counts=True)
+    rows[survivors] = survivors
+    rows[rows < 0] = np.repeat(survivors, repeats - 1)
+    return rows
+
+
+class Particles:
+    """Resampler of groups of particles, the children of one parent (``parents`` (B,) are hashable and have a generator
+    each in ``rngs``) that are denoised in one batch. At ``resamplings`` steps the weights are exp(strength * (value -
+    value at the last resampling)), whose product along a path is exp(strength * last value) (Singhal et al. 2025,
+    difference potential). ``values`` gives Φ (B,) of denoised scenes.
+    """
+
+    def __init__(
+        self,
+        parents: Sequence[Any],
+        rngs: dict[Any, np.random.Generator],
+        values: Callable[[SceneBatch], Tensor],
+        resamplings: int,
+        begin: float,
+        strength: float,
+    ) -> None:
+        self.groups = {parent: np.flatnonzero([parent == other for other in parents]) for parent in rngs}
+        self.rngs, self.values = rngs, values
+        self.resamplings, self.begin, self.strength = resamplings, begin, strength
+        self.before = np.zeros(len(parents))
+
+    def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch]) -> Tensor | None:
+        """(B,) index of the particle that each place continues with; None at a step without resampling."""
+        if step not in self.at(steps):
+            return None
+        now = self.values(denoised()).double().numpy()
+        rows = np.arange(len(now))
+        for parent, group in self.groups.items():
+            log_weights = self.strength * (now[group] - self.before[group])
+            rows[group] = group[systematic(np.exp(log_weights - log_weights.max()), self.rngs[parent].random())]
+        self.before = now[rows]
+        return torch.from_numpy(rows)
+
+    def at(self, steps: int) -> list[int]:
+        """Steps at which particles are resampled: evenly spaced from ``begin`` on, without the last."""
+        first = int(self.begin * steps)
+        return sorted({first + (i * (steps - 1 - first)) // self.resamplings for i in range(self.resamplings)})
+
+
+@register_planner("feynman_kac")
+@dataclass(frozen=True)
+class FeynmanKacPlanner(PlannerSettings):
+    """Feynman-Kac steering of every inpainting (Singhal et al. 2025), in rounds of iterated repair.
+
+    A round denoises ``particles`` inpaintings of the current state in one batch. During the denoising, the objective
+    scores the scene that the network expects of each particle, and particles with higher scores replace others. The
+    finished scenes are treated as in :class:`~agents.planning.GreedyPlanner`. Resampling costs evaluations of the
+    objective, but none of the denoiser.
+
+    Attributes:
+        particles: number of inpaintings per round, one batch of the denoiser.
+        resamplings: number of resamplings per round.
+        begin: share of the denoising steps before the first resampling.
+        strength: λ in the weight exp(λ Φ) of a particle; 0 resamples nothing.
+    """
+
+    name: str = "feynman_kac"
+    widens = True
+    steers = True
+    particles: Count = 8
+    resamplings: Count = 2
+    begin: Annotated[float, BELOW_ONE] = 0.7
+    strength: Annotated[float, at_least(0)] = 50.0
+
+    def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
+        """Spend up to ``budget`` expansions below the current state.
+
+        Raises:
+            InvalidInputError: the expansions of ``problem`` cannot be steered.
+        """
+        steered = SteeredProblem(problem, self.name, self.steering)
+        return GreedyPlanner(children=self.particles).plan(steered, budget, progress)
+
+    def steering(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Particles:
+        """The resampling of the inpaintings of ``pairs``, with a random generator for each parent."""
+        parents, rngs = [(state.seed, state.path) for state, _ in pairs], {}
+        for (seed, path), (_, action) in zip(parents, pairs, strict=True):
+            if (seed, path) not in rngs:  # spawn keys 0 and 1 are for the noise and the mask of the child
+                source = np.random.SeedSequence(entropy=seed, spawn_key=(*path, action, 2))
+                rngs[seed, path] = np.random.default_rng(source)
+        return Particles(parents, rngs, values, self.resamplings, self.begin, self.strength)
 
 
 if __name__ == "__main__":

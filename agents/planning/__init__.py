@@ -6,7 +6,6 @@ from scene_envs.registry import lazy_names
 
 if TYPE_CHECKING:
     from agents.planning.evolution import EvolutionPlanner
-    from agents.planning.feynman_kac import FeynmanKacPlanner
     from agents.planning.gradient import GradientPlanner
     from agents.planning.ledger import (
         PlannerSettings,
@@ -28,7 +27,6 @@ __all__ = [
     "BeamPlanner",
     "BestOfPlanner",
     "EvolutionPlanner",
-    "FeynmanKacPlanner",
     "GradientPlanner",
     "GreedyPlanner",
     "Journal",

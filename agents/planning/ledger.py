@@ -238,7 +238,7 @@ class PlannerSettings(Checked):
         return replace(self, **unset) if unset else self
 
 
-_SHIPPED = {name: name for name in ("evolution", "feynman_kac", "gradient", "mcts")}
+_SHIPPED = {name: name for name in ("evolution", "gradient", "mcts")}
 _SHIPPED |= dict.fromkeys(("beam", "best_of", "greedy"), "simple")
 _PLANNERS: Registry[type[PlannerSettings]] = Registry(
     "planner", ENTRY_POINT_GROUP, modules={name: f"agents.planning.{file}" for name, file in _SHIPPED.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import itertools
 import math
@@ -22,11 +21,12 @@ import torch
 
 from agents.planning.ledger import PlanResult, Progress, Searchable, SearchStoppedError, state_value
 from agents.utils.interrupts import Terminated, terminable
-from scene_envs.envs import MaskChoiceState, SearchState
+from scene_envs.envs import SearchState
 from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.files import tensors_digest
 from scene_envs.scene import SceneBatch
 
-_MAGIC = b"scene-envs search 1\n"
+_MAGIC = b"scene-envs search 2\n"
 _HEAD = struct.Struct("<II")
 """Length and CRC-32 of a record."""
 
@@ -56,11 +56,7 @@ class Journal:
                 raise InvalidInputError(
                     f"{self.path} holds a search with {name}={before}, not {now}; give another output, or that value"
                 )
-        self._states = [_state(values) for states in records[1:] for values in states]
-
-    def __len__(self) -> int:
-        """Number of states that an earlier run wrote."""
-        return len(self._states)
+        self._states = [SearchState(**values) for states in records[1:] for values in states]
 
     def take(self, pairs: Sequence[tuple[SearchState, int]]) -> list[SearchState]:
         """The states that an earlier run made for the first of ``pairs``; as many as the file still has.
@@ -86,7 +82,7 @@ class Journal:
         """All states in the file, in order, with one round in memory at a time."""
         with self.path.open("rb") as file:
             for record in islice(self._records(file), 1, None):
-                yield from map(_state, record)
+                yield from (SearchState(**values) for values in record)
 
     def _append(self, content: Any) -> None:
         buffer = io.BytesIO()
@@ -123,10 +119,6 @@ class Journal:
             yield torch.load(io.BytesIO(record), weights_only=True)
 
 
-def _state(values: Mapping[str, Any]) -> SearchState:
-    return MaskChoiceState(**values) if "masks" in values else SearchState(**values)
-
-
 def _described(value: Any) -> str:
     """A setting as text, the same in every process: a prior by its weights, an object with ``described_by`` by its
     value, a dataclass by its class and the fields that differ from the defaults, and other objects by their class
@@ -139,13 +131,9 @@ def _described(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_described, value)) + "]"
     if isinstance(value, SceneBatch):
-        content = value.tensor.contiguous().numpy().tobytes()
-        return f"{len(value)} scenes {hashlib.blake2b(content, digest_size=8).hexdigest()}"
+        return f"{len(value)} scenes {tensors_digest({'scenes': value.tensor})[:16]}"
     if hasattr(value, "weights"):
-        digest = hashlib.blake2b(digest_size=8)
-        for name, tensor in sorted(value.weights().items()):
-            digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
-        return f"weights {digest.hexdigest()}"
+        return f"weights {tensors_digest({name: tensor.cpu() for name, tensor in value.weights().items()})[:16]}"
     if hasattr(value, "described_by"):
         return _described(value.described_by)
     kind = value if hasattr(value, "__qualname__") else type(value)

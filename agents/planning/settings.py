@@ -21,7 +21,7 @@ from scene_envs.errors import Count, InvalidInputError, Natural, Unlimited
 
 @dataclass
 class BudgetKeys:
-    """Budget of a search; :class:`SearchConfig` describes the keys."""
+    """Budget of a search."""
 
     budget: int = 64
     max_nfe: int | None = None

@@ -28,12 +28,12 @@ class BestOfPlanner(PlannerSettings):
     children by their path, the first samples are the same as with any other planner.
 
     Attributes:
-        parallel: number of scenes per batch of the denoiser.
+        parallel: number of scenes per batch of the denoiser; large batches cost less per scene.
     """
 
     name: str = "best_of"
     widens = True
-    parallel: Count = 16
+    parallel: Count = 64
 
     def plan(self, problem: Searchable, budget: int, progress: Progress | None = None) -> PlanResult:
         """Spend up to ``budget`` expansions, or as many as the root has actions."""

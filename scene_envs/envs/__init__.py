@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from scene_envs.envs.denoising_adapters import DenoisingEnv, DenoisingTorchRLEnv, DenoisingVectorEnv
     from scene_envs.envs.masks import MaskGenerator, list_masks, register_mask
     from scene_envs.envs.scoring import Score
-    from scene_envs.envs.search import MaskChoiceProblem, MaskChoiceState, SearchProblem, SearchState
+    from scene_envs.envs.search import SearchProblem, SearchState
     from scene_envs.envs.search_gymnasium import SearchEnv, SearchMaskEnv
     from scene_envs.envs.spaces import ResetNeededError
 
@@ -23,8 +23,6 @@ __all__ = [
     "DenoisingEnv",
     "DenoisingTorchRLEnv",
     "DenoisingVectorEnv",
-    "MaskChoiceProblem",
-    "MaskChoiceState",
     "MaskGenerator",
     "ResetNeededError",
     "Score",

@@ -21,12 +21,11 @@ from scene_envs.envs.spaces import (
     ResetNeededError,
     check_action,
     check_slots,
-    decode_scenes,
     occupied,
-    prior_features,
     resolve_scene_and_prior,
 )
 from scene_envs.errors import InvalidInputError
+from scene_envs.protocols import EncodedPriorLike
 from scene_envs.scene import SceneBatch
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
@@ -80,6 +79,9 @@ class DenoisingCore:
         **settings: fields of :class:`~scene_envs.envs.settings.DenoisingSettings`; ``prompt`` and ``guidance`` as for
             :class:`~scene_envs.envs.scoring.EnvPrompts`.
 
+    Attributes:
+        features: D, numbers per slot that the prior denoises; the scene type's, except for priors with other rotations.
+
     Raises:
         InvalidInputError, UnknownNameError: an argument is outside what is accepted.
 
@@ -98,7 +100,8 @@ class DenoisingCore:
         self.num_envs = num_envs
         self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior, chosen.device)
         self.slots = check_slots(self.scene_type, chosen.slots)
-        self._features = prior_features(self.prior)
+        prior = self.prior
+        self.features = prior.features if isinstance(prior, EncodedPriorLike) else self.scene_type.features
         self.action_mode = chosen.action_mode
         self.max_action = float(chosen.max_action)
         self.table = self.prior.step_table(chosen.num_steps)
@@ -115,11 +118,6 @@ class DenoisingCore:
         self._x = torch.zeros(num_envs, self.slots, self.features, device=self.device)
         self._prompts = [""] * num_envs
         self._read_prompts()
-
-    @property
-    def features(self) -> int:
-        """D, numbers per slot that the prior denoises; the scene type's D, except for priors with other rotations."""
-        return self._features
 
     @property
     def x(self) -> Tensor:
@@ -148,7 +146,9 @@ class DenoisingCore:
 
     def scenes(self) -> SceneBatch:
         """The current scenes, decoded on the device of the prior: rotations in SO(3), arg-max categories."""
-        return decode_scenes(self.prior, self._x)
+        if isinstance(self.prior, EncodedPriorLike) and self.features != self.scene_type.features:
+            return self.prior.decode(self._x)
+        return SceneBatch.from_tensor(self._x, self.scene_type, normalised=self.prior.normalizer)
 
     def object_mask(self) -> Tensor:
         """(B, N) int8: slots whose arg-max category is not empty; slots that are not drawn yet count as empty."""

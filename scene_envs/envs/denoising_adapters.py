@@ -394,12 +394,10 @@ class DenoisingVectorEnv(SpecMixin, VectorEnv[Observation, np.ndarray, np.ndarra
 
 
 def _check_autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    if isinstance(mode, AutoresetMode):
-        return mode
-    known = {m.value: m for m in AutoresetMode}
-    if mode not in known:
-        raise unknown_name("autoreset mode", str(mode), known)
-    return known[mode]
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        raise unknown_name("autoreset mode", str(mode), [known.value for known in AutoresetMode]) from None
 
 
 def _spread_seed(seed: int | list[int | None] | None, count: int) -> list[int | None]:

@@ -6,8 +6,8 @@ import hashlib
 import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from scene_envs.envs.masks import MaskGenerator, mask_for_prompt, masked_slots, resolve_mask
 from scene_envs.envs.scoring import EnvPrompts, RewardScorer, Score, prior_device
-from scene_envs.envs.settings import SearchMaskSettings, SearchSettings, TreeSettings, check_physics_guidance, takes
+from scene_envs.envs.settings import SearchMaskSettings, SearchSettings, check_physics_guidance, takes
 from scene_envs.envs.spaces import check_slots, resolve_scene_and_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
@@ -39,7 +39,7 @@ class SearchState:
 
     Attributes:
         scene: (N, D) float32 raw scene; never write into it.
-        mask: (N,) bool, slots that the next action regenerates.
+        masks: (K, N) bool, slots that each mask to choose from regenerates; K is 1 without a choice.
         depth: Number of actions since the root.
         path: Actions since the root.
         seed: Seed of the root; with ``path`` it fixes all random numbers of this state and of those below it.
@@ -48,11 +48,11 @@ class SearchState:
         valid: Whether the objective could score this scene.
         trace: Tensors from the object that steered the denoising, such as an intermediate scene; usually None.
 
-    Two states are equal when they are the same node: same seed, path, scene and mask.
+    Two states are equal when they are the same node: same seed, path, scene and masks.
     """
 
     scene: Tensor
-    mask: Tensor
+    masks: Tensor
     depth: int
     path: tuple[int, ...]
     seed: int
@@ -65,10 +65,15 @@ class SearchState:
         if not isinstance(other, SearchState):
             return NotImplemented
         same_node = (self.seed, self.path) == (other.seed, other.path)
-        return same_node and torch.equal(self.scene, other.scene) and torch.equal(self.mask, other.mask)
+        return same_node and torch.equal(self.scene, other.scene) and torch.equal(self.masks, other.masks)
 
     def __hash__(self) -> int:
         return hash((self.seed, self.path))
+
+    @property
+    def mask(self) -> Tensor:
+        """(N,) bool, slots that the next action may regenerate."""
+        return self.masks.any(dim=0)
 
     @property
     def fingerprint(self) -> bytes:
@@ -77,26 +82,16 @@ class SearchState:
         return hashlib.blake2b(b"".join(sorted(row.tobytes() for row in rows)), digest_size=16).digest()
 
 
-@dataclass(frozen=True)
-class NodeRandomness:
-    """The two independent sources of random numbers of one node of the tree."""
+def node_randomness(seed: int, path: tuple[int, ...]) -> tuple[torch.Generator, np.random.Generator]:
+    """The independent sources of random numbers of the node at ``path`` below the root of ``seed``, functions of these
+    two alone: one for the diffusion that makes the node's scene, and one for the node's masks.
 
-    noise: torch.Generator  # torch generator for the diffusion that makes the node's scene
-    mask: np.random.Generator  # NumPy generator for the node's mask
-
-    @classmethod
-    def at(cls, seed: int, path: tuple[int, ...]) -> NodeRandomness:
-        """The sources of the node at ``path`` below the root of ``seed``: a function of these two alone.
-
-        >>> a, b = NodeRandomness.at(7, (0, 2)), NodeRandomness.at(7, (0, 2))
-        >>> a.noise.initial_seed() == b.noise.initial_seed()
-        True
-        """
-        noise, mask = np.random.SeedSequence(entropy=seed, spawn_key=path).spawn(2)
-        return cls(
-            torch.Generator().manual_seed(int(noise.generate_state(1, np.uint64)[0] >> np.uint64(1))),
-            np.random.default_rng(mask),
-        )
+    >>> node_randomness(7, (0, 2))[0].initial_seed() == node_randomness(7, (0, 2))[0].initial_seed()
+    True
+    """
+    noise, mask = np.random.SeedSequence(entropy=seed, spawn_key=path).spawn(2)
+    start = int(noise.generate_state(1, np.uint64)[0] >> np.uint64(1))
+    return torch.Generator().manual_seed(start), np.random.default_rng(mask)
 
 
 class SearchProblem:
@@ -106,36 +101,39 @@ class SearchProblem:
     subtree does not depend on the order of expansion. Expanding in different batches may change the network's
     rounding by about 1e-6, never the random numbers.
 
+    With ``masks`` in place of ``mask`` an action also chooses the mask of slots to regenerate: action ``k * branching +
+    j`` is inpainting j of mask k. It is legal where mask k has a slot.
+
     Args:
-        **settings: Fields of :class:`~scene_envs.envs.settings.SearchSettings`.
+        **settings: Fields of :class:`~scene_envs.envs.settings.SearchSettings`, or of
+            :class:`~scene_envs.envs.settings.SearchMaskSettings`.
 
     Attributes:
         evaluations: Number of denoiser evaluations (NFE) so far, ``num_steps`` per generated scene and twice that many
             with guidance.
         num_actions: Number of actions of a state, legal or not.
+        mask_generators: The K masks.
+        mask_names: Their names, in the order of the actions.
 
     >>> problem = SearchProblem(objective="object_count", num_steps=2, max_depth=1)
     >>> root = problem.root(seed=0)
     >>> children = problem.expand_batch([(root, action) for action in problem.legal_actions(root)])
     >>> [child.path for child in children], problem.evaluations
     ([(0,), (1,), (2,), (3,)], 10)
+    >>> problem = SearchProblem(objective="object_count", num_steps=2, masks=["empty", "random"], branching=2)
+    >>> list(problem.legal_actions(problem.root(seed=0)))
+    [0, 2, 1, 3]
     """
-
-    state_type: type[SearchState] = SearchState
 
     @takes(SearchSettings)
     def __init__(self, **settings: Any) -> None:
-        chosen = SearchSettings(**settings)
-        self._begin(chosen)
-        self.mask_generator = self._resolve_mask(chosen.mask)
-
-    def _begin(self, chosen: TreeSettings) -> None:
-        """Resolve all settings but the mask."""
+        chosen = SearchMaskSettings(**settings) if "masks" in settings else SearchSettings(**settings)
+        masks = chosen.masks if isinstance(chosen, SearchMaskSettings) else [chosen.mask]
         self.scene_type, self.prior = resolve_scene_and_prior(chosen.scene, chosen.prior, chosen.device)
         self.slots = check_slots(self.scene_type, chosen.slots)
         self.device = prior_device(self.prior)
         self.branching, self.max_depth, self.num_steps = chosen.branching, chosen.max_depth, chosen.num_steps
-        self.num_actions, self.max_nfe = chosen.branching, chosen.max_nfe
+        self.num_actions, self.max_nfe = len(masks) * chosen.branching, chosen.max_nfe
         self.claim_guidance, self.physics_guidance = chosen.claim_guidance, chosen.physics_guidance
         check_physics_guidance(self.physics_guidance, self.scene_type)
         self._may_be_guided = "physics_guidance" in inspect.signature(self.prior.inpaint).parameters
@@ -153,17 +151,15 @@ class SearchProblem:
         self.scale = chosen.objective_scale or declared or float(free_slots)
         self.evaluations = 0
         self._warned_of_scale = self._warned_of_zero = False
-
-    def _resolve_mask(self, mask: Any) -> MaskGenerator:
-        return mask_for_prompt(resolve_mask(mask), self.prompt)
+        self.mask_generators = [mask_for_prompt(resolve_mask(mask), self.prompt) for mask in masks]
+        self.mask_names = tuple(map(_name, masks))
 
     def root(self, seed: int, scene: SceneBatch | None = None) -> SearchState:
         """The root of ``seed``: ``scene`` (a batch of one), or a sample of the prior."""
-        source = NodeRandomness.at(seed, ())
         if scene is None:
             empty = SceneBatch.empty(self.scene_type, 1, self.slots)
             everything = torch.ones(1, self.slots, dtype=torch.bool) & self._changeable()
-            scene = self._inpaint(empty, everything, [source.noise])
+            scene = self._inpaint(empty, everything, [node_randomness(seed, ())[0]])
         elif len(scene) != 1 or scene.tensor.shape[1] != self.slots or scene.scene_type.name != self.scene_type.name:
             raise InvalidInputError(
                 f"the root must be one {self.scene_type.name!r} scene of {self.slots} slots, not {scene}"
@@ -187,7 +183,7 @@ class SearchProblem:
         paths = [(*state.path, int(action)) for state, action in pairs]
         parents = SceneBatch(torch.stack([state.scene for state, _ in pairs]), self.scene_type)
         masks = torch.stack([self.mask_of(state, action) for state, action in pairs])
-        noises = [NodeRandomness.at(state.seed, path).noise for (state, _), path in zip(pairs, paths, strict=True)]
+        noises = [node_randomness(state.seed, path)[0] for (state, _), path in zip(pairs, paths, strict=True)]
         watch = None if steering is None else steering(pairs, self._values)
         children = self._inpaint(parents, masks, noises, watch)
         origins = [(state.seed, path, state.value) for (state, _), path in zip(pairs, paths, strict=True)]
@@ -198,16 +194,23 @@ class SearchProblem:
         return states
 
     def legal_actions(self, state: SearchState) -> Sequence[int]:
-        """All inpaintings; none at ``max_depth`` and where nothing is left to improve."""
-        return () if state.depth >= self.max_depth or self.is_solved(state) else self._open_actions(state)
+        """The inpaintings of masks that have a slot; none at ``max_depth`` and where nothing is left to improve. One
+        inpainting of every mask comes before the second of any, so that the first few actions try all masks.
+        """
+        if state.depth >= self.max_depth or self.is_solved(state):
+            return ()
+        if len(state.masks) == 1:
+            return range(self.branching)
+        masks = torch.nonzero(state.masks.any(dim=1)).flatten().tolist()
+        return [mask * self.branching + child for child in range(self.branching) for mask in masks]
 
     def mask_of(self, state: SearchState, action: int) -> Tensor:
         """(N,) bool, the slots that ``action`` regenerates in ``state``."""
-        return state.mask
+        return state.masks[action // self.branching]
 
     def is_solved(self, state: SearchState) -> bool:
         """Whether nothing is left to improve: no slot is masked, or Φ is 1, its largest value."""
-        return state.value >= 1.0 or not bool(state.mask.any())
+        return state.value >= 1.0 or not bool(state.masks.any())
 
     def without_masked(self, state: SearchState) -> SearchState:
         """The same node without the objects that are still masked."""
@@ -219,10 +222,6 @@ class SearchProblem:
         batch = SceneBatch(scene.unsqueeze(0), self.scene_type)
         return self._score(batch, [(state.seed, state.path, state.value)])[0]
 
-    def _open_actions(self, state: SearchState) -> Sequence[int]:
-        """Actions that regenerate something in ``state``, in the order in which planners try them."""
-        return range(self.branching)
-
     def _check_legal(self, state: SearchState, action: int) -> None:
         if not isinstance(action, (int, np.integer)) or not 0 <= action < self.num_actions:
             raise InvalidInputError(f"action={action!r}: choose one of the inpaintings 0..{self.num_actions - 1}")
@@ -232,6 +231,12 @@ class SearchProblem:
             )
         if self.is_solved(state):
             raise InvalidInputError(f"nothing is left to improve in the state at path {state.path}: it has no children")
+        if not bool(self.mask_of(state, action).any()):
+            name = self.mask_names[action // self.branching]
+            raise InvalidInputError(
+                f"action={action}: mask {name!r} has no slot in the state at path {state.path}; legal actions are "
+                f"{sorted(self.legal_actions(state))}"
+            )
 
     def _changeable(self) -> Tensor:
         """(N,) bool: slots that may be regenerated, all but those of fixed welded objects."""
@@ -296,9 +301,9 @@ class SearchProblem:
                 "{name: weighted_sum, rewards: [...], offset: minus the value that becomes 0}",
                 objective,
             )
-        return self.state_type(
+        return SearchState(
             scene=scene.tensor[0].clone(),
-            **self._masks(scene, score, seed, path),
+            masks=torch.stack([self._mask(generator, scene, score, seed, path) for generator in self.mask_generators]),
             depth=len(path),
             path=path,
             seed=seed,
@@ -307,17 +312,13 @@ class SearchProblem:
             valid=valid,
         )
 
-    def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Any]:
-        """The mask fields of the state."""
-        return {"mask": self._mask(self.mask_generator, scene, score, seed, path)}
-
     def _mask(
         self, generator: MaskGenerator, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]
     ) -> Tensor:
         """(N,) bool: slots that ``generator`` masks at this node, or all if no object is free; welded ones left out."""
         changeable = self._changeable() & ~scene.is_welded[0]
         if bool(scene.is_free.any()):
-            changeable &= masked_slots(generator, scene, score, NodeRandomness.at(seed, path).mask)
+            changeable &= masked_slots(generator, scene, score, node_randomness(seed, path)[1])
         return changeable
 
     def close(self) -> None:
@@ -330,78 +331,6 @@ def _check_takes(prior: Any, role: str, remedy: str) -> None:
     keys = inspect.signature(prior.inpaint).parameters.values()
     if not any(key.name == role or key.kind is inspect.Parameter.VAR_KEYWORD for key in keys):
         raise InvalidInputError(f"inpaint of {type(prior).__name__} takes no {role}=; {remedy}")
-
-
-@dataclass(frozen=True, eq=False)
-class MaskChoiceState(SearchState):
-    """A partial scene with K masks to choose from; ``mask`` is the union of them.
-
-    Attributes:
-        masks: (K, N) bool, slots that each mask regenerates.
-    """
-
-    masks: Tensor = field(kw_only=True)
-
-    def __eq__(self, other: object) -> bool:
-        same = super().__eq__(other)
-        return same and torch.equal(self.masks, cast(MaskChoiceState, other).masks)
-
-    __hash__ = SearchState.__hash__
-
-
-class MaskChoiceProblem(SearchProblem):
-    """The tree of partial scenes in which an action also chooses the mask of slots to regenerate.
-
-    Action ``k * branching + j`` is inpainting j of mask k. It is legal where mask k has a slot. With a single mask
-    the tree equals that of a :class:`~scene_envs.envs.search.SearchProblem` with this mask, bit for bit.
-
-    Args:
-        **settings: Fields of :class:`~scene_envs.envs.settings.SearchMaskSettings`.
-
-    Attributes:
-        mask_names: Names of the K masks, in the order of the actions.
-
-    >>> problem = MaskChoiceProblem(objective="object_count", num_steps=2, masks=["empty", "random"], branching=2)
-    >>> root = problem.root(seed=0)
-    >>> list(problem.legal_actions(root)), tuple(root.masks.shape)
-    ([0, 2, 1, 3], (2, 34))
-    """
-
-    state_type = MaskChoiceState
-
-    @takes(SearchMaskSettings)
-    def __init__(self, **settings: Any) -> None:
-        chosen = SearchMaskSettings(**settings)
-        self._begin(chosen)
-        self.mask_generators: list[MaskGenerator] = [self._resolve_mask(mask) for mask in chosen.masks]
-        self.mask_names = tuple(_name(mask) for mask in chosen.masks)
-        self.num_actions = len(self.mask_generators) * self.branching
-
-    def mask_of(self, state: SearchState, action: int) -> Tensor:
-        """(N,) bool, the slots that ``action`` regenerates in ``state``."""
-        return self.masks_of(state)[action // self.branching]
-
-    def masks_of(self, state: SearchState) -> Tensor:
-        """(K, N) bool, the slots that each mask regenerates in ``state``."""
-        return cast(MaskChoiceState, state).masks
-
-    def _open_actions(self, state: SearchState) -> Sequence[int]:
-        """One inpainting of every mask before the second of any, so that the first few actions try all masks."""
-        masks = torch.nonzero(self.masks_of(state).any(dim=1)).flatten().tolist()
-        return [mask * self.branching + child for child in range(self.branching) for mask in masks]
-
-    def _check_legal(self, state: SearchState, action: int) -> None:
-        super()._check_legal(state, action)
-        if not bool(self.mask_of(state, action).any()):
-            name = self.mask_names[action // self.branching]
-            raise InvalidInputError(
-                f"action={action}: mask {name!r} has no slot in the state at path {state.path}; legal actions are "
-                f"{sorted(self.legal_actions(state))}"
-            )
-
-    def _masks(self, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]) -> dict[str, Any]:
-        masks = torch.stack([self._mask(generator, scene, score, seed, path) for generator in self.mask_generators])
-        return {"mask": masks.any(dim=0), "masks": masks}
 
 
 def _name(mask: Any) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from torch import Tensor
 
-from scene_envs.envs.search import MaskChoiceProblem, SearchProblem, SearchState, Steering
+from scene_envs.envs.search import SearchProblem, SearchState, Steering
 from scene_envs.envs.settings import SearchMaskSettings, SearchSettings, takes
 from scene_envs.envs.spaces import (
     STATE_BOUND,
@@ -130,19 +130,16 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
 
     @takes(SearchSettings)
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
-        problem = SearchProblem(**settings)
-        self._begin(problem, render_mode, spaces.MultiBinary(problem.slots))
-
-    def _begin(self, problem: SearchProblem, render_mode: str | None, regenerate: spaces.Space[Any]) -> None:
-        """Set up an environment over ``problem``; ``regenerate`` is the space of the observed masks."""
         self.render_mode = check_render_mode(render_mode, _RENDER_MODES)
         self._viewer: LiveViewer | None = None  # the page of "human", made at the first reset
-        self.problem = problem
+        self.problem = problem = SearchProblem(**settings)
+        self._chooses = "masks" in settings
+        choice = spaces.Box(0, 1, (len(problem.mask_names), problem.slots), np.int8)
         self.observation_space = spaces.Dict(
             {
                 "scene": scene_box(STATE_BOUND, problem.slots, problem.scene_type.features),
                 "object_mask": spaces.MultiBinary(problem.slots),
-                "regenerate": regenerate,
+                "regenerate": choice if self._chooses else spaces.MultiBinary(problem.slots),
                 "depth": spaces.Box(0, problem.max_depth, (1,), np.int64),
                 "value": spaces.Box(0.0, 1.0, (1,), np.float32),
             }
@@ -196,15 +193,16 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
                 return observation, 0.0, solved, not solved, info
             raise ResetNeededError(f"the episode ended, {why}; call reset() first")
         self._begun = True
-        self._state = self._child(parent, action)
+        is_action = isinstance(action, int | np.integer) and 0 <= action < self.problem.num_actions
+        if is_action and not bool(self.problem.mask_of(parent, action).any()):
+            self._state = replace(parent, depth=parent.depth + 1, path=(*parent.path, int(action)))
+        else:
+            self._state = self.expand(parent, action)
         self._show(self._state)
         observation, info = self._observe(self._state)
         terminated = self.problem.is_solved(self._state)
         truncated = not terminated and bool(self._end(self._state))
         return observation, self._state.value - parent.value, terminated, truncated, info
-
-    def _child(self, state: SearchState, action: int) -> SearchState:
-        return self.expand(state, action)
 
     def _end(self, state: SearchState) -> str:
         """Reason why the episode ends at ``state``; empty where it goes on."""
@@ -312,14 +310,16 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         return self.problem.evaluations - self._nfe_at_reset
 
     def _check_state(self, state: Any) -> SearchState:
-        kind = self.problem.state_type
-        if not isinstance(state, kind):
+        if not isinstance(state, SearchState):
             raise InvalidInputError(
-                f"a {kind.__name__} is needed, as clone_state() or expand() gives, not {type(state).__name__}"
+                f"a SearchState is needed, as clone_state() or expand() gives, not {type(state).__name__}"
             )
         shape = (self.problem.slots, self.problem.scene_type.features)
         if tuple(state.scene.shape) != shape:
             raise InvalidInputError(f"the state's scene has shape {tuple(state.scene.shape)}, here scenes are {shape}")
+        names = self.problem.mask_names
+        if len(state.masks) != len(names):
+            raise InvalidInputError(f"the state has {len(state.masks)} masks, this environment {len(names)}: {names}")
         return state
 
     def _remember(self, states: Sequence[SearchState]) -> None:
@@ -334,7 +334,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         observation = {
             "scene": normalised.numpy(),
             "object_mask": present,
-            "regenerate": state.mask.numpy().astype(np.int8),
+            "regenerate": (state.masks if self._chooses else state.mask).numpy().astype(np.int8),
             "depth": np.array([state.depth], np.int64),
             "value": np.array([state.value], np.float32),
         }
@@ -387,7 +387,7 @@ class SearchMaskEnv(SearchEnv):
 
     ## Starting State
 
-    As in [Search-v0](search.md#starting-state); a state that is given is a `MaskChoiceState`.
+    As in [Search-v0](search.md#starting-state); a state that is given has as many masks.
 
     ## Episode End
 
@@ -418,27 +418,6 @@ class SearchMaskEnv(SearchEnv):
     * v0: initial version.
     """  # noqa: E501  (rows of a table)
 
-    problem: MaskChoiceProblem
-
     @takes(SearchMaskSettings)
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
-        problem = MaskChoiceProblem(**settings)
-        self._begin(problem, render_mode, spaces.Box(0, 1, (len(problem.mask_names), problem.slots), np.int8))
-
-    def _child(self, state: SearchState, action: int) -> SearchState:
-        is_action = isinstance(action, int | np.integer) and 0 <= action < self.problem.num_actions
-        if is_action and not bool(self.problem.mask_of(state, action).any()):
-            return replace(state, depth=state.depth + 1, path=(*state.path, int(action)))
-        return super()._child(state, action)
-
-    def _check_state(self, state: Any) -> SearchState:
-        checked, masks = super()._check_state(state), self.problem.mask_names
-        if len(self.problem.masks_of(checked)) != len(masks):
-            raise InvalidInputError(
-                f"the state has {len(self.problem.masks_of(checked))} masks, this environment {len(masks)}: {masks}"
-            )
-        return checked
-
-    def _observe(self, state: SearchState) -> tuple[Observation, dict[str, Any]]:
-        observation, info = super()._observe(state)
-        return {**observation, "regenerate": self.problem.masks_of(state).numpy().astype(np.int8)}, info
+        super().__init__(render_mode=render_mode, **{"masks": SearchMaskSettings.masks, **settings})

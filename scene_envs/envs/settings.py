@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
-import numpy as np
-
-from scene_envs.errors import MAX_NUMBER, Checked, InvalidInputError, Limit, OneOf, Positive, shown
+from scene_envs.errors import Checked, InvalidInputError, Limit, OneOf, Positive
 from scene_envs.scene_types import SceneType
 
 ACTION_MODES = ("next_sample", "noise")
@@ -18,6 +17,14 @@ PROMPT_SOURCES = ("data", "grammar")
 
 _WHOLE = Limit(
     lambda number: type(number) is int and 1 <= number < 2**31, "must be a whole number from 1 to 2,147,483,647"
+)
+_GUIDANCE = Limit(math.isfinite, "must be a finite number; 0 follows the prompt as it is")
+_CLAIM_GUIDANCE = Limit(
+    lambda strength: 0 <= strength < math.inf, "must be a finite number of at least 0; 0 guides nothing"
+)
+_PHYSICS_GUIDANCE = Limit(
+    lambda strength: 0 <= strength <= 1,
+    "must be a number from 0 to 1; 0 guides nothing, and 1 moves objects until they neither overlap nor float",
 )
 _SLOTS = Limit(lambda number: type(number) is int and 1 <= number <= 10**5, "must be a whole number from 1 to 100,000")
 MASKS = (
@@ -118,8 +125,7 @@ class SearchMaskSettings(TreeSettings):
 
 def check_guidance(prompt: Any, guidance: Any) -> None:
     """Refuse (InvalidInputError) guidance that is no finite number, or has no prompt; ``""`` is none."""
-    if not _is_finite(guidance):
-        raise InvalidInputError(f"guidance={shown(guidance)} must be a finite number; 0 follows the prompt as it is")
+    _GUIDANCE.check("", "guidance", guidance, False)
     if guidance and not prompt:
         raise InvalidInputError(
             f"guidance={guidance:g} strengthens a prompt, and prompt={prompt!r} asks for none; "
@@ -129,10 +135,7 @@ def check_guidance(prompt: Any, guidance: Any) -> None:
 
 def check_claim_guidance(prompt: Any, strength: Any) -> None:
     """Refuse (InvalidInputError) claim guidance that is no number of at least 0, or has no prompt; ``""`` is none."""
-    if not _is_finite(strength) or strength < 0:
-        raise InvalidInputError(
-            f"claim_guidance={shown(strength)} must be a finite number of at least 0; 0 guides nothing"
-        )
+    _CLAIM_GUIDANCE.check("", "claim_guidance", strength, False)
     if strength and not prompt:
         raise InvalidInputError(
             f"claim_guidance={strength:g} guides scenes to the claims of a prompt, and prompt={prompt!r} has none; "
@@ -142,24 +145,12 @@ def check_claim_guidance(prompt: Any, strength: Any) -> None:
 
 def check_physics_guidance(strength: Any, scene_type: SceneType | None = None) -> None:
     """Refuse (InvalidInputError) physics guidance that is no number from 0 to 1, or of assets without geometry."""
-    if not _is_finite(strength) or not 0 <= strength <= 1:
-        raise InvalidInputError(
-            f"physics_guidance={shown(strength)} must be a number from 0 to 1; 0 guides nothing, and 1 moves objects "
-            "until they neither overlap nor float"
-        )
+    _PHYSICS_GUIDANCE.check("", "physics_guidance", strength, False)
     if strength and scene_type is not None and not scene_type.has_geometry:
         raise InvalidInputError(
             f"physics_guidance={strength:g} needs the geometry of the assets, which scene type {scene_type.name!r} "
             "does not have; leave physics_guidance=0"
         )
-
-
-def _is_finite(number: Any) -> bool:
-    """Whether a value is a number that a float holds."""
-    if isinstance(number, bool) or not isinstance(number, int | float | np.integer | np.floating):
-        return False
-    size: Any = abs(number)
-    return bool(size <= MAX_NUMBER)
 
 
 def takes(settings: type[Any]) -> Callable[[Init], Init]:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, SceneEnvsError
-from scene_envs.protocols import EncodedPriorLike, PriorLike
+from scene_envs.protocols import PriorLike
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
@@ -59,18 +59,6 @@ def check_slots(scene_type: SceneType, slots: int | None) -> int:
 def scene_box(bound: float, slots: int, features: int) -> spaces.Box:
     """Box(-bound, bound, (N, D), float32)."""
     return spaces.Box(-bound, bound, (slots, features), np.float32)
-
-
-def prior_features(prior: PriorLike) -> int:
-    """D of the scenes that the prior denoises: the scene type's, unless the prior has its own."""
-    return prior.features if isinstance(prior, EncodedPriorLike) else prior.scene_type.features
-
-
-def decode_scenes(prior: PriorLike, x: Tensor) -> SceneBatch:
-    """The scenes of x (B, N, D), on its device: rotations in SO(3), arg-max categories."""
-    if isinstance(prior, EncodedPriorLike) and prior.features != prior.scene_type.features:
-        return prior.decode(x)
-    return SceneBatch.from_tensor(x, prior.scene_type, normalised=prior.normalizer)
 
 
 def occupied(x: Tensor, scene_type: SceneType) -> Tensor:

@@ -243,7 +243,7 @@ def test_a_mask_of_an_installed_package_works_by_name(monkeypatch: pytest.Monkey
 
 def test_the_environment_and_the_search_run_have_one_default(prior: ToyPrior, free_objects: Any) -> None:
     env = gym.make(ID, prior=prior, objective=free_objects, num_steps=1).unwrapped
-    assert env.problem.mask_generator is resolve_mask(SearchConfig().mask) is blamed_or_empty_mask
+    assert env.problem.mask_generators == [resolve_mask(SearchConfig().mask)] == [blamed_or_empty_mask]
 
 
 def fails(scene: SceneBatch, score: Score, rng: np.random.Generator) -> Any:

@@ -48,7 +48,6 @@ SMALLER: dict[str, dict[str, str]] = {
     "docs/planners/best_of.md": {"branching=8": "branching=2", "budget=8": "budget=2"},
     "docs/planners/beam.md": {"budget=10": "budget=4"},
     "docs/planners/evolution.md": {"budget=10": "budget=6"},
-    "docs/planners/feynman_kac.md": {"particles=4": "particles=2", "budget=8": "budget=4"},
     "docs/planners/greedy.md": {"children=3": "children=2", "budget=9": "budget=4"},
     "docs/planners/mcts.md": {"branching=3": "branching=2", "children=3": "children=2", "budget=9": "budget=4"},
     "docs/search.md": {

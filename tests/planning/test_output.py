@@ -37,10 +37,12 @@ def search(output: Path, **settings: Any) -> SearchOutcome:
 def chain(depth: int, width: int) -> tuple[list[SearchState], dict[int, tuple[int, ...]]]:
     """A root and ``width`` children at each of ``depth`` steps, of which the last is inpainted on; values rise."""
     scene = SceneBatch.empty("dimsum_table", 1).tensor[0]
-    mask = torch.arange(34) == 2
-    states, path = [SearchState(scene, mask, 0, (), 5, 0.0, 0.0, True)], ()
+    masks = torch.arange(34)[None] == 2
+    states, path = [SearchState(scene, masks, 0, (), 5, 0.0, 0.0, True)], ()
     for step in range(1, depth + 1):
-        states += [SearchState(scene, mask, step, (*path, k), 5, step / depth, float(step), True) for k in range(width)]
+        states += [
+            SearchState(scene, masks, step, (*path, k), 5, step / depth, float(step), True) for k in range(width)
+        ]
         path = (*path, width - 1)
     return states, {5: path}
 

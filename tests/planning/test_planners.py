@@ -1,4 +1,4 @@
-"""Planners on small deterministic trees: best of N, greedy, beam, MCTS, evolution, Feynman-Kac, and an example's."""
+"""Planners on small deterministic trees: best of N, greedy, beam, MCTS, evolution, and an example's."""
 
 from __future__ import annotations
 
@@ -18,14 +18,12 @@ from agents.planning import (
     BeamPlanner,
     BestOfPlanner,
     EvolutionPlanner,
-    FeynmanKacPlanner,
     GreedyPlanner,
     MCTSPlanner,
     list_planners,
     run_search,
 )
 from agents.planning.evolution import spliced
-from agents.planning.feynman_kac import Particles, systematic
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext
 from scene_envs.errors import InvalidInputError
@@ -96,7 +94,7 @@ def example() -> ModuleType:
     return load_example("planners")
 
 
-@pytest.mark.parametrize("name", ["uct", "tree_over_steps"])
+@pytest.mark.parametrize("name", ["uct", "tree_over_steps", "feynman_kac"])
 def test_planners_of_the_example_are_registered_and_search(example: ModuleType, name: str) -> None:
     assert name in list_planners()
     settings: dict[str, Any] = {"budget": 12, "branching": 3, "num_steps": 4, "seed": 3, "slots": 12, "planner": name}
@@ -274,13 +272,13 @@ def test_mcts_stops_where_nothing_is_masked_and_removes_what_is() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "planner",
-    [EvolutionPlanner(population=3, children=2, crossover=0.8), FeynmanKacPlanner(particles=4, begin=0.0)],
-    ids=lambda planner: planner.name,
-)
+@pytest.mark.parametrize("name", ["evolution", "feynman_kac"])
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
-def test_the_budget_is_spent_to_the_last_evaluation_and_the_best_is_kept(planner: Any, process: str) -> None:
+def test_the_budget_is_spent_to_the_last_evaluation_and_the_best_is_kept(
+    example: ModuleType, name: str, process: str
+) -> None:
+    resampled = example.FeynmanKacPlanner(particles=4, begin=0.0)
+    planner = resampled if name == "feynman_kac" else EvolutionPlanner(population=3, children=2, crossover=0.8)
     result, env = plan(planner, process)
     assert len(result.values) == 14
     assert env.nfe == 14 * 4
@@ -356,21 +354,23 @@ def test_crossover_makes_other_scenes() -> None:
 # -- Feynman-Kac ----------------------------------------------------------------------------------
 
 
-def test_systematic_resampling_gives_every_particle_its_share() -> None:
+def test_systematic_resampling_gives_every_particle_its_share(example: ModuleType) -> None:
     weights = np.random.default_rng(0).dirichlet(np.full(7, 0.5))
     grid = (np.arange(7000) + 0.5) / 7000
-    counts = np.array([np.bincount(systematic(3.0 * weights, uniform), minlength=7) for uniform in grid])
+    counts = np.array([np.bincount(example.systematic(3.0 * weights, uniform), minlength=7) for uniform in grid])
     np.testing.assert_allclose(counts.mean(axis=0), 7 * weights, atol=1e-3)
     assert bool((np.abs(counts - 7 * weights) < 1).all())
-    rows = systematic(weights, 0.3)
+    rows = example.systematic(weights, 0.3)
     assert rows[rows].tolist() == rows.tolist()  # who goes on keeps its place
-    assert systematic(np.ones(5), 0.999).tolist() == [0, 1, 2, 3, 4]
+    assert example.systematic(np.ones(5), 0.999).tolist() == [0, 1, 2, 3, 4]
 
 
-def test_particles_follow_the_tilted_distribution() -> None:
+def test_particles_follow_the_tilted_distribution(example: ModuleType) -> None:
     count, size, strength = 40_000, 0.1, 6.0
     rng, place = np.random.default_rng(1), np.zeros(40_000)
-    particles = Particles(["a"] * count, {"a": np.random.default_rng(2)}, lambda values: values, 4, 0.0, strength)
+    particles = example.Particles(
+        ["a"] * count, {"a": np.random.default_rng(2)}, lambda values: values, 4, 0.0, strength
+    )
     assert particles.at(5) == [0, 1, 2, 3]
     for step in range(4):
         place = place + size * rng.choice([-1.0, 1.0], count)
@@ -383,23 +383,23 @@ def test_particles_follow_the_tilted_distribution() -> None:
     assert place.var() == pytest.approx(4 * size**2 / math.cosh(strength * size) ** 2, rel=0.05)
 
 
-def test_particles_give_way_to_those_of_their_own_parent() -> None:
+def test_particles_give_way_to_those_of_their_own_parent(example: ModuleType) -> None:
     rngs = {parent: np.random.default_rng(0) for parent in "ab"}
     values = torch.tensor([0.0, 0.1, 1.0, 0.9, 0.0])
-    rows = Particles(list("aabab"), rngs, lambda _: values, 1, 0.0, 1000.0)(0, 2, lambda: None)
+    rows = example.Particles(list("aabab"), rngs, lambda _: values, 1, 0.0, 1000.0)(0, 2, lambda: None)
     assert rows.tolist() == [3, 3, 2, 3, 2]
 
 
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
-def test_without_strength_particles_are_greedy_repair(process: str) -> None:
-    steered, _ = plan(FeynmanKacPlanner(particles=3, strength=0.0), process)
+def test_without_strength_particles_are_greedy_repair(example: ModuleType, process: str) -> None:
+    steered, _ = plan(example.FeynmanKacPlanner(particles=3, strength=0.0), process)
     greedy, _ = plan(GreedyPlanner(children=3), process)
     assert steered.values == greedy.values
 
 
-def test_a_problem_that_cannot_be_steered_is_refused() -> None:
+def test_a_problem_that_cannot_be_steered_is_refused(example: ModuleType) -> None:
     with pytest.raises(InvalidInputError, match="expand_batch of ToyTree takes no steering="):
-        FeynmanKacPlanner().plan(ToyTree(scrambled), budget=5)
+        example.FeynmanKacPlanner().plan(ToyTree(scrambled), budget=5)
 
 
 @pytest.mark.parametrize("process", ["mixed", "continuous"])

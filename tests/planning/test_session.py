@@ -23,12 +23,11 @@ from scene_envs.scene import SceneBatch
 from tests.helpers.toy_tree import ToyTree, scrambled
 
 SETTINGS: dict[str, Any] = {"budget": 15, "branching": 3, "num_steps": 2, "seed": 3, "baseline": False, "slots": 12}
-PLANNERS = ("beam", "best_of", "evolution", "feynman_kac", "gradient", "greedy", "mcts")
+PLANNERS = ("beam", "best_of", "evolution", "gradient", "greedy", "mcts")
 ROUNDS_OF_THREE: dict[str, dict[str, Any]] = {
     "best_of": {"parallel": 3},
     "beam": {"width": 1},
     "evolution": {"population": 3, "crossover": 0.0},
-    "feynman_kac": {"particles": 3, "resamplings": 1},
 }
 
 
@@ -97,8 +96,6 @@ def test_an_interrupt_keeps_the_best_and_the_same_call_goes_on(
     calls = Counting(interrupt) if count == 1 else Counting()
     if count > 1:  # every search has a root of its own, scored before the rounds
         calls.calls, calls.act = -(count - 1), interrupt
-    if planner == "feynman_kac":  # scores every round twice
-        calls.calls -= 2
     stopped = run_search(prior, calls, output=tmp_path, **settings)
     assert stopped.metrics["stopped"] == "interrupt"
     assert stopped.metrics["nfe"] == 2 * 6 * count
@@ -177,11 +174,8 @@ def test_many_searches_run_in_parts_whose_scenes_are_kept_after_a_kill(prior: Sc
     assert [plan.best_value for plan in whole.searches] == sorted((p.best_value for p in alone), reverse=True)
 
 
-@pytest.mark.parametrize("planner", ["evolution", "feynman_kac"])
-def test_side_by_side_as_alone_with_planners_that_score_on_the_way(planner: str, prior: ScenePrior) -> None:
-    settings = {**SETTINGS, "planner": {"name": planner, **ROUNDS_OF_THREE[planner], "crossover": 0.9}}
-    if planner == "feynman_kac":
-        del settings["planner"]["crossover"]
+def test_side_by_side_as_alone_with_a_planner_that_scores_splices(prior: ScenePrior) -> None:
+    settings = {**SETTINGS, "planner": {"name": "evolution", "population": 3, "crossover": 0.9}}
     together = run_search(prior, near_middle, count=2, **settings)
     alone = [run_search(prior, near_middle, **{**settings, "seed": seed}).search for seed in (3, 4)]
     assert sorted(plan.values for plan in alone) == sorted(plan.values for plan in together.searches)
@@ -226,7 +220,7 @@ def test_another_search_in_the_folder_is_refused(prior: ScenePrior, tmp_path: Pa
         ({"planner": {"name": "beam", "width": 0}}, "planner beam: width=0 must be at least 1"),
         ({"planner": {"name": "mcts", "rollout": "some"}}, "unknown rollout 'some'"),
         ({"planner": {"name": "evolution", "crossover": 2}}, "planner evolution: crossover=2.0 is outside 0..1"),
-        ({"planner": {"name": "feynman_kac", "begin": 1}}, "planner feynman_kac: begin=1.0 must lie in"),
+        ({"planner": {"name": "gradient", "begin": 1}}, "planner gradient: begin=1.0 must lie in"),
         ({"mask": {"name": "empty", "cuont": 1}}, "did you mean 'count'"),
     ],
 )
