@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from agents.diffusion import CategoricalProcess, GaussianProcess
-from agents.diffusion.categorical import one_hot
 from agents.diffusion.gaussian import Moments
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.text import Text, TextEncoder
@@ -110,7 +110,7 @@ class Replays:
     def run(self, network: nn.Module, *inputs: Tensor, **named: Tensor | None) -> Any:
         """``network(*inputs, **named)``: a tensor or a tuple of tensors."""
         if inputs[0].device.type != self._on or self._fails or torch.is_grad_enabled():
-            return network(*inputs, **named)
+            return _plain(network, *inputs, **named)
         given = [*inputs, *named.values()]
         layout = tuple((value.shape, value.dtype) if isinstance(value, Tensor) else value for value in given)
         weights = tuple(weight.data_ptr() for weight in network.parameters())
@@ -126,17 +126,17 @@ class Replays:
                 known + 1 < _CAPTURED_AT
                 or sum(not isinstance(entry, int) for entry in self._known.values()) >= _MAX_GRAPHS
             ):
-                return network(*inputs, **named)
+                return _plain(network, *inputs, **named)
             known = self._captured(network, inputs, named)
             if known is None:
-                return network(*inputs, **named)
+                return _plain(network, *inputs, **named)
             self._known[key] = known
         kept, replay, outputs = known
         for place, value in zip(kept, given, strict=True):
             if isinstance(value, Tensor):
                 place.copy_(value)
         replay()
-        return outputs.clone() if isinstance(outputs, Tensor) else tuple(output.clone() for output in outputs)
+        return _copied(outputs)
 
     def _captured(self, network: nn.Module, inputs: Sequence[Tensor], named: dict[str, Tensor | None]) -> Any:
         """Inputs, replay and outputs of a captured call; None if it cannot be captured."""
@@ -157,6 +157,22 @@ class Replays:
             )
             return None
         return [*own, *others.values()], replay, outputs
+
+
+def _plain(network: nn.Module, *inputs: Tensor, **named: Tensor | None) -> Any:
+    """A call that is not captured; without gradients in inference mode, in which operations do less beside their work.
+
+    The outputs are copied, so that they may be used where gradients are recorded.
+    """
+    if torch.is_grad_enabled():
+        return network(*inputs, **named)
+    with torch.inference_mode():
+        outputs = network(*inputs, **named)
+    return _copied(outputs)
+
+
+def _copied(outputs: Any) -> Any:
+    return outputs.clone() if isinstance(outputs, Tensor) else tuple(output.clone() for output in outputs)
 
 
 def autocast(like: Tensor, precision: torch.dtype) -> torch.autocast:
@@ -292,6 +308,9 @@ class MixedDenoiser(nn.Module):
         mean, std = (None, None) if by_category is None else by_category.given_state(categories)
         self._mean: Tensor | None
         self._std: Tensor | None
+        self._certain: Tensor
+        certain = _CERTAIN * (torch.eye(categories.categories + 1, categories.categories) - 1.0)
+        self.register_buffer("_certain", certain, persistent=False)
         self.register_buffer("_mean", mean, persistent=False)
         self.register_buffer("_std", std, persistent=False)
         self.network = network
@@ -346,9 +365,8 @@ class MixedDenoiser(nn.Module):
         set_precision(self, self.poses, t)
         if self.drops_empty:
             output, logits = self._on_present(inputs, time, text)
-            count = self.categories.categories
-            certain = _CERTAIN * (one_hot(states, count, logits.dtype) - 1.0)
-            return output, torch.where((states < count)[..., None], certain, logits)
+            certain = F.embedding(states, self._certain).to(logits)
+            return output, torch.where((states < self.categories.categories)[..., None], certain, logits)
         results = []
         for rows in parts_of(*pose.shape[:2]):
             words = None if text is None else (text[0][rows], text[1][rows])

@@ -53,8 +53,9 @@ class _Gelu(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor) -> Tensor:
         if ctx is not None:
             ctx.save_for_backward(x)
-        inner = torch.addcmul(x, x * x, x, value=0.044715).mul_(math.sqrt(2.0 / math.pi)).tanh_()
-        return torch.addcmul(x, x, inner).mul_(0.5)
+        inner = x * x
+        torch.addcmul(x, inner, x, value=0.044715, out=inner).mul_(math.sqrt(2.0 / math.pi)).tanh_()
+        return torch.addcmul(x, x, inner, out=inner).mul_(0.5)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
@@ -535,7 +536,8 @@ class MixedFlux(nn.Module):
         biases: Tensor | None, scene: Scene,
     ) -> Tensor:  # fmt: skip
         if biases is not None and scene.slot_mask is not None:  # once for all blocks
-            biases = biases.masked_fill_(~scene.slot_mask[:, None, None], -torch.inf)
+            absent = torch.zeros_like(scene.slot_mask, dtype=biases.dtype).masked_fill_(~scene.slot_mask, -torch.inf)
+            biases = biases.add_(absent[:, None, None])
         chosen: Iterator[Tensor | None] = itertools.repeat(None) if biases is None else iter(biases)
         reaches = words is not None and self.config.text_reach == "all"
         if words is not None:
