@@ -1,7 +1,7 @@
 """Baseline networks: MiDiffusion and DiffuScene, with inputs for slots, time and text and outputs for slots in common.
 
-The *trunk* between inputs and outputs maps tokens (B, N, H), a time embedding (B, H) and text (B, L, H) with its mask
-(B, 1, 1, L), both None without text, to tokens (B, N, H).
+The *trunk* between inputs and outputs maps tokens (B, N, H), a time embedding (B, H) and text (B, L, H) with its
+padding (B, L), both None without text, to tokens (B, N, H).
 
 MiDiffusion (Hu et al. 2024, "Mixed Diffusion for 3D Indoor Scene Synthesis", section on the denoising network) is a
 transformer over the objects of a scene, without positional encoding, whose layer norms are functions of time. The
@@ -64,27 +64,15 @@ class MixedBaselineConfig(BaselineConfig):
     categories: int
 
 
-class Attention(nn.Module):
-    """Multi-head attention of tokens (B, N, H) to ``source`` (B, M, H), which may be the same tokens.
+def attention(hidden: int, heads: int) -> nn.MultiheadAttention:
+    """Attention of torch for tokens (B, N, H)."""
+    return nn.MultiheadAttention(hidden, heads, batch_first=True)
 
-    >>> attention = Attention(hidden=16, heads=2)
-    >>> attention(torch.randn(2, 5, 16), torch.randn(2, 3, 16)).shape
-    torch.Size([2, 5, 16])
-    """
 
-    def __init__(self, hidden: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.query = nn.Linear(hidden, hidden)
-        self.key_value = nn.Linear(hidden, 2 * hidden)
-        self.out = nn.Linear(hidden, hidden)
-
-    def forward(self, tokens: Tensor, source: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Attended (B, N, H); ``mask`` (B, 1, 1, M) is True where to attend."""
-        query = self.query(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-        key, value = self.key_value(source).unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        attended = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
-        return self.out(attended.transpose(1, 2).flatten(-2))
+def attended(layer: nn.MultiheadAttention, tokens: Tensor, source: Tensor, padding: Tensor | None = None) -> Tensor:
+    """Tokens (B, N, H) after attention to ``source`` (B, M, H); ``padding`` (B, M) is True where nothing attends."""
+    result: Tensor = layer(tokens, source, source, key_padding_mask=padding, need_weights=False)[0]
+    return result
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -116,14 +104,14 @@ class _Baseline(nn.Module):
         condition = self.time_in(timestep_embedding(time, _TIME_WIDTH).to(tokens.dtype))
         if self.text_in is None:
             return self.trunk(tokens, condition, None, None)
-        mask = None
+        padding = None
         if text is None:
             text = tokens.new_zeros(len(tokens), 1, self.text_in.in_features)
         elif text_mask is not None:
             text = text * text_mask[..., None]
             somewhere = text_mask.any(dim=-1, keepdim=True)
-            mask = (text_mask | ~somewhere)[:, None, None]  # a row of padding alone is read as no text
-        return self.trunk(tokens, condition, self.text_in(text), mask)
+            padding = ~text_mask & somewhere  # a row of padding alone is read as no text
+        return self.trunk(tokens, condition, self.text_in(text), padding)
 
 
 class ContinuousBaseline(_Baseline):
@@ -216,16 +204,16 @@ class _Block(nn.Module):
         super().__init__()
         hidden = config.hidden
         self.norm, self.feed_norm = _AdaptiveNorm(hidden), _AdaptiveNorm(hidden)
-        self.attention = Attention(hidden, config.heads)
+        self.attention = attention(hidden, config.heads)
         self.text_norm = _AdaptiveNorm(hidden) if config.text_width else None
-        self.text_attention = Attention(hidden, config.heads) if config.text_width else None
+        self.text_attention = attention(hidden, config.heads) if config.text_width else None
         self.feed = mlp(hidden, 4 * hidden, hidden)
 
-    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
         normal = self.norm(tokens, condition)
-        tokens = tokens + self.attention(normal, normal)
+        tokens = tokens + attended(self.attention, normal, normal)
         if self.text_norm is not None and self.text_attention is not None and text is not None:
-            tokens = tokens + self.text_attention(self.text_norm(tokens, condition), text, mask)
+            tokens = tokens + attended(self.text_attention, self.text_norm(tokens, condition), text, padding)
         return tokens + self.feed(self.feed_norm(tokens, condition))
 
 
@@ -236,9 +224,9 @@ class _Transformer(nn.Module):
         super().__init__()
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.depth))
 
-    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
         for block in self.blocks:
-            tokens = block(tokens, condition, text, mask)
+            tokens = block(tokens, condition, text, padding)
         return tokens
 
 
@@ -325,16 +313,17 @@ class _Attend(nn.Module):
         super().__init__()
         hidden, heads = config.hidden, config.heads
         self.norm = nn.GroupNorm(heads, hidden)
-        self.attention = Attention(hidden, heads)
+        self.attention = attention(hidden, heads)
         self.text_norm = nn.GroupNorm(heads, hidden) if config.text_width else None
-        self.text_attention = Attention(hidden, heads) if config.text_width else None
+        self.text_attention = attention(hidden, heads) if config.text_width else None
 
-    def forward(self, x: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+    def forward(self, x: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
         """Channels (B, H, N) to the same."""
         normal = self.norm(x).transpose(1, 2)
-        x = x + self.attention(normal, normal).transpose(1, 2)
+        x = x + attended(self.attention, normal, normal).transpose(1, 2)
         if self.text_norm is not None and self.text_attention is not None and text is not None:
-            x = x + self.text_attention(self.text_norm(x).transpose(1, 2), text, mask).transpose(1, 2)
+            normal = self.text_norm(x).transpose(1, 2)
+            x = x + attended(self.text_attention, normal, text, padding).transpose(1, 2)
         return x
 
 
@@ -347,10 +336,10 @@ class _Level(nn.Module):
         self.blocks = nn.ModuleList(_Residual(config, width) for width in widths)
         self.attend = _Attend(config)
 
-    def forward(self, x: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+    def forward(self, x: Tensor, condition: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
         for block in self.blocks:
             x = block(x, condition)
-        return self.attend(x, text, mask)
+        return self.attend(x, text, padding)
 
 
 class _UNet(nn.Module):
@@ -367,19 +356,19 @@ class _UNet(nn.Module):
         self.to_fine = nn.ModuleList(nn.Conv1d(hidden, hidden, 3, padding=1) for _ in range(config.levels - 1))
         self.up = nn.ModuleList(_Level(config, 2 * hidden) for _ in range(config.levels))
 
-    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
         x = self.first(tokens.transpose(1, 2))
         skips: list[Tensor] = []
         for index, level in enumerate(self.down):
             x = self.to_coarse[index - 1](x) if index else x
-            x = level(x, condition, text, mask)
+            x = level(x, condition, text, padding)
             skips.append(x)
-        x = self.middle_out(self.middle(self.middle_in(x, condition), text, mask), condition)
+        x = self.middle_out(self.middle(self.middle_in(x, condition), text, padding), condition)
         for index, level in enumerate(self.up):
             skip = skips.pop()
             if index:
                 x = self.to_fine[index - 1](x.repeat_interleave(2, dim=-1)[..., : skip.shape[-1]])
-            x = level(torch.cat([x, skip], dim=1), condition, text, mask)
+            x = level(torch.cat([x, skip], dim=1), condition, text, padding)
         return x.transpose(1, 2)
 
 

@@ -455,14 +455,11 @@ def run_packed(
         run: function of rows, index and mask of :func:`pack` that gives two tensors (b, M, W).
         widths: W of the two outputs.
     """
-    parts: list[list[Tensor]] = []
-    order: list[Tensor] = []
+    parts, order = [], []
     for rows, index, mask in pack(active):
+        values = torch.cat(run(rows, index, mask), dim=-1).mul_(mask[..., None])
+        blank = values.new_zeros(len(values), active.shape[1], sum(widths))
+        parts.append(blank.scatter_(1, index[..., None].expand_as(values), values))
         order.append(rows)
-        parts.append([])
-        for values, width in zip(run(rows, index, mask), widths, strict=True):
-            blank = values.new_zeros(len(values), active.shape[1], width)
-            parts[-1].append(blank.scatter(1, index[..., None].expand(-1, -1, width), values * mask[..., None]))
-    back = torch.argsort(torch.cat(order))
-    first, second = (torch.cat(side)[back] for side in zip(*parts, strict=True))
+    first, second = torch.cat(parts)[torch.argsort(torch.cat(order))].split(widths, dim=-1)
     return first, second

@@ -445,7 +445,7 @@ class Contacts(FluxModule):
         present = (1.0 - torch.eye(states.shape[1], dtype=both.dtype, device=both.device)).expand_as(both[0])
         present = present if slot_mask is None else present * slot_mask.unsqueeze(1)
         sign, aside = sign / both * present, aside * present
-        parts = [aside / both[:1], sign[1:5], sign[5:, None] * theirs.transpose(0, 1)]
+        parts = [aside / both[:1], sign[1:5], sign[5:, None] * turns.transpose(0, 1).contiguous().unsqueeze(-2)]
         parts += [part * gap for part, gap in zip(parts, (bounded[:1], bounded[1:5], bounded[5:, None]), strict=True)]
         ways = torch.cat([*(part.reshape(-1, *shape) for part in parts), present.unsqueeze(0)])
         gathered = weighed.movedim(0, -2) @ ways.permute(1, 2, 3, 0)  # (B, N, W, 2 * 15 + 1), summed over other slots
