@@ -15,6 +15,7 @@ the order of slots, although scenes have no order.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -32,7 +33,7 @@ _TIME_WIDTH = 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaselineConfig:
+class BaselineConfig(ABC):
     """Common part of the sizes of all baselines.
 
     Attributes:
@@ -51,6 +52,10 @@ class BaselineConfig:
                 raise InvalidInputError(f"{name}={getattr(self, name)} is not positive")
         if self.hidden % self.heads:
             raise InvalidInputError(f"hidden={self.hidden} is not a multiple of heads={self.heads}")
+
+    @abstractmethod
+    def trunk(self) -> nn.Module:
+        """The trunk with fresh weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,13 +96,13 @@ def head(hidden: int, outputs: int) -> nn.Sequential:
 class _Baseline(nn.Module):
     """A trunk with inputs for time and text."""
 
-    def __init__(self, config: BaselineConfig, trunk: nn.Module) -> None:
+    def __init__(self, config: BaselineConfig) -> None:
         super().__init__()
+        self.trunk = config.trunk()
         self.config = config
         hidden = config.hidden
         self.time_in = mlp(_TIME_WIDTH, hidden, hidden)
         self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None
-        self.trunk = trunk
 
     def _tokens(self, tokens: Tensor, time: Tensor, text: Tensor | None, text_mask: Tensor | None) -> Tensor:
         """Tokens (B, N, H) through the trunk; ``time`` (B,)."""
@@ -115,12 +120,18 @@ class _Baseline(nn.Module):
 
 
 class ContinuousBaseline(_Baseline):
-    """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D), which starts at zero."""
+    """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D), which starts at zero.
 
-    def __init__(self, config: BaselineConfig, features: int, trunk: nn.Module) -> None:
-        super().__init__(config, trunk)
-        self.scene_in = mlp(features, config.hidden, config.hidden)
-        self.scene_out = head(config.hidden, features)
+    >>> network = ContinuousBaseline(DiffuSceneConfig(features=20, hidden=16, heads=2))
+    >>> x = torch.randn(2, 35, 20)
+    >>> network(x, x, torch.tensor([0.1, 0.2])).shape
+    torch.Size([2, 35, 20])
+    """
+
+    def __init__(self, config: Any) -> None:
+        super().__init__(config)
+        self.scene_in = mlp(config.features, config.hidden, config.hidden)
+        self.scene_out = head(config.hidden, config.features)
 
     def forward(self, x: Tensor, position: Tensor, noise_level: Tensor) -> Tensor:
         """Predict from (B, N, D) network input of unit variance and the noise-to-signal ratio (B,), whose logarithm is
@@ -130,10 +141,17 @@ class ContinuousBaseline(_Baseline):
 
 
 class MixedBaseline(_Baseline):
-    """Poses (B, N, 12) and category states (B, N) to a pose output (B, N, 12) and logits (B, N, K), zero at first."""
+    """Poses (B, N, 12) and category states (B, N) to a pose output (B, N, 12) and logits (B, N, K), zero at first.
 
-    def __init__(self, config: MixedBaselineConfig, trunk: nn.Module) -> None:
-        super().__init__(config, trunk)
+    >>> network = MixedBaseline(MixedMiDiffusionConfig(categories=8, hidden=32, depth=2, heads=2, text_width=16))
+    >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
+    >>> out, logits = network(pose, states, torch.tensor([3.0, 7.0]), text=torch.randn(2, 4, 16))
+    >>> out.shape, logits.shape
+    (torch.Size([2, 5, 12]), torch.Size([2, 5, 8]))
+    """
+
+    def __init__(self, config: MixedBaselineConfig) -> None:
+        super().__init__(config)
         hidden = config.hidden
         self.pose_in = mlp(POSE_FEATURES, hidden, hidden)
         self.category_in = nn.Embedding(config.categories + 1, hidden)
@@ -162,10 +180,13 @@ class MixedBaseline(_Baseline):
 class _MiDiffusionSize(BaselineConfig):
     depth: int = 6
 
+    def trunk(self) -> nn.Module:
+        return _Transformer(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class MiDiffusionConfig(_MiDiffusionSize):
-    """Size of a :class:`MiDiffusion`.
+    """Size of MiDiffusion for continuous scenes, permutation-equivariant in the slots.
 
     Further fields are those of :class:`BaselineConfig`.
 
@@ -179,7 +200,7 @@ class MiDiffusionConfig(_MiDiffusionSize):
 
 @dataclass(frozen=True, kw_only=True)
 class MixedMiDiffusionConfig(_MiDiffusionSize, MixedBaselineConfig):
-    """Size of a :class:`MixedMiDiffusion`: that of :class:`MiDiffusionConfig`, and :class:`MixedBaselineConfig`."""
+    """Size of MiDiffusion for mixed scenes: that of :class:`MiDiffusionConfig`, and :class:`MixedBaselineConfig`."""
 
 
 class _AdaptiveNorm(nn.Module):
@@ -230,33 +251,6 @@ class _Transformer(nn.Module):
         return tokens
 
 
-class MiDiffusion(ContinuousBaseline):
-    """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D); permutation-equivariant in N.
-
-    >>> network = MiDiffusion(MiDiffusionConfig(features=20, hidden=32, depth=2, heads=2))
-    >>> x = torch.randn(2, 34, 20)
-    >>> network(x, x, torch.tensor([0.1, 0.2])).shape
-    torch.Size([2, 34, 20])
-    """
-
-    def __init__(self, config: MiDiffusionConfig) -> None:
-        super().__init__(config, config.features, _Transformer(config))
-
-
-class MixedMiDiffusion(MixedBaseline):
-    """Poses (B, N, 12) and states (B, N) to a pose output (B, N, 12) and logits (B, N, K); permutation-equivariant.
-
-    >>> network = MixedMiDiffusion(MixedMiDiffusionConfig(categories=8, hidden=32, depth=2, heads=2, text_width=16))
-    >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
-    >>> out, logits = network(pose, states, torch.tensor([3.0, 7.0]), text=torch.randn(2, 4, 16))
-    >>> out.shape, logits.shape
-    (torch.Size([2, 5, 12]), torch.Size([2, 5, 8]))
-    """
-
-    def __init__(self, config: MixedMiDiffusionConfig) -> None:
-        super().__init__(config, _Transformer(config))
-
-
 # -- DiffuScene -----------------------------------------------------------------------------------
 
 
@@ -266,10 +260,13 @@ class _DiffuSceneSize(BaselineConfig):
     levels: int = 4
     blocks: int = 2
 
+    def trunk(self) -> nn.Module:
+        return _UNet(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class DiffuSceneConfig(_DiffuSceneSize):
-    """Size of a :class:`DiffuScene`.
+    """Size of DiffuScene for continuous scenes, which depends on the order of slots.
 
     Attributes:
         features: D, numbers per slot.
@@ -284,7 +281,7 @@ class DiffuSceneConfig(_DiffuSceneSize):
 
 @dataclass(frozen=True, kw_only=True)
 class MixedDiffuSceneConfig(_DiffuSceneSize, MixedBaselineConfig):
-    """Size of a :class:`MixedDiffuScene`: that of :class:`DiffuSceneConfig`, and :class:`MixedBaselineConfig`."""
+    """Size of DiffuScene for mixed scenes: that of :class:`DiffuSceneConfig`, and :class:`MixedBaselineConfig`."""
 
 
 class _Residual(nn.Module):
@@ -372,33 +369,6 @@ class _UNet(nn.Module):
         return x.transpose(1, 2)
 
 
-class DiffuScene(ContinuousBaseline):
-    """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D); depends on the order of slots.
-
-    >>> network = DiffuScene(DiffuSceneConfig(features=20, hidden=16, heads=2))
-    >>> x = torch.randn(2, 35, 20)
-    >>> network(x, x, torch.tensor([0.1, 0.2])).shape
-    torch.Size([2, 35, 20])
-    """
-
-    def __init__(self, config: DiffuSceneConfig) -> None:
-        super().__init__(config, config.features, _UNet(config))
-
-
-class MixedDiffuScene(MixedBaseline):
-    """Poses (B, N, 12) and states (B, N) to a pose output (B, N, 12) and logits (B, N, K); depends on slot order.
-
-    >>> network = MixedDiffuScene(MixedDiffuSceneConfig(categories=8, hidden=16, heads=2, text_width=16))
-    >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
-    >>> out, logits = network(pose, states, torch.tensor([3.0, 7.0]), text=torch.randn(2, 4, 16))
-    >>> out.shape, logits.shape
-    (torch.Size([2, 5, 12]), torch.Size([2, 5, 8]))
-    """
-
-    def __init__(self, config: MixedDiffuSceneConfig) -> None:
-        super().__init__(config, _UNet(config))
-
-
 # -- registration ---------------------------------------------------------------------------------
 
 
@@ -406,7 +376,7 @@ def _diffuscene(keys: Mapping[str, Any]) -> dict[str, Any]:
     return {**{name: keys[name] for name in ("hidden", "heads", "text_width")}, "blocks": max(1, keys["depth"] // 3)}
 
 
-register_network("midiffusion", "continuous", MiDiffusionConfig, MiDiffusion)
-register_network("midiffusion", "mixed", MixedMiDiffusionConfig, MixedMiDiffusion)
-register_network("diffuscene", "continuous", DiffuSceneConfig, DiffuScene, sizes=_diffuscene)
-register_network("diffuscene", "mixed", MixedDiffuSceneConfig, MixedDiffuScene, sizes=_diffuscene)
+register_network("midiffusion", "continuous", MiDiffusionConfig, ContinuousBaseline)
+register_network("midiffusion", "mixed", MixedMiDiffusionConfig, MixedBaseline)
+register_network("diffuscene", "continuous", DiffuSceneConfig, ContinuousBaseline, sizes=_diffuscene)
+register_network("diffuscene", "mixed", MixedDiffuSceneConfig, MixedBaseline, sizes=_diffuscene)
