@@ -18,6 +18,7 @@ from agents.networks.denoisers import Replays, check_precision, parts_of, produc
 from agents.networks.flux import gelu
 from agents.networks.geometry import nearest_rotations
 from agents.priors.testing import tiny_prior
+from scene_envs.arrays import constant_on
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 
@@ -229,3 +230,9 @@ def test_calls_without_gradients_are_in_inference_mode_and_their_outputs_serve_w
     assert factor.grad.tolist() == [2.0, 2.0, 2.0]
     assert replays.run(network, factor).requires_grad
     assert network.modes == [True, False]
+
+
+def test_constants_that_move_to_a_device_in_inference_mode_serve_where_gradients_are_recorded() -> None:
+    with torch.inference_mode():
+        moved = constant_on(torch.ones(2), torch.device("meta"))
+    assert not moved.is_inference()
