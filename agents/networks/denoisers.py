@@ -200,9 +200,10 @@ class _Denoiser(nn.Module):
         """(B,) noise-to-signal ratio of scenes ``like`` (B, N, D) at ``t``, and the network told what precision its
         blocks have there: that of chains at one noisy timestep.
         """
-        if hasattr(self.network, "body_precision"):
+        network: Any = self.network
+        if hasattr(network, "body_precision"):
             noisy = isinstance(t, int) and float(self.process.sigma[t]) > _FINE * float(self.process.alpha[t])
-            self.network.body_precision = self.chain_precision if noisy else "float32"
+            network.body_precision = self.chain_precision if noisy else "float32"
         alpha, sigma = self.process.rates(t, like)
         ratio = sigma / alpha
         return ratio.reshape(t.shape) if isinstance(t, Tensor) else ratio.expand(len(like))
