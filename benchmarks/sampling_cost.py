@@ -59,6 +59,10 @@ class Products(TorchDispatchMode):
         self, function: Any, types: Sequence[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         named = kwargs or {}
+        with self:  # in inference mode, operations that consist of others come whole
+            parts = function.decompose(*args, **named)
+        if parts is not NotImplemented:
+            return parts
         if function._schema.name in PRODUCTS:
             key = f"{function} {[_layout(arg) for arg in args]} { {name: _layout(arg) for name, arg in named.items()} }"
             if key not in self._ready:

@@ -78,7 +78,10 @@ def constant_on(constant: Tensor, device: torch.device) -> Tensor:
         return constant
     copies = _copies().setdefault(constant, {})
     if device not in copies:
-        copies[device] = constant.to(device)
+        import torch
+
+        with torch.inference_mode(False):  # a copy that serves where gradients are recorded, too
+            copies[device] = constant.to(device)
     return copies[device]
 
 

@@ -155,10 +155,6 @@ class CategoricalProcess:
         kept = keep * F.one_hot(x0, self.categories) + _replaced(keep, mask) / self.categories
         return torch.cat([kept, mask.expand(*x0.shape, 1)], dim=-1).float()
 
-    def add_noise(self, x0: Tensor, t: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """A sample of q(x_t | x_0), int64 like ``x0``."""
-        return sample_categorical(self.marginal(x0, t), generator)
-
     def prior(self) -> Tensor:
         """(K + 1,) distribution of x_T: the marginal of uniformly drawn data."""
         mask = self.schedule.mask[-1]
@@ -211,10 +207,6 @@ class CategoricalProcess:
         keep, mask = (constant_on(rate, like.device)[t] for rate in (self.schedule.keep, self.schedule.mask))
         return _broadcast(keep, like), _broadcast(mask, like)
 
-    def log_prob(self, x_s: Tensor, probs: Tensor) -> Tensor:
-        """(...) log-probability of the states ``x_s`` under ``probs`` (..., K + 1)."""
-        return probs.gather(-1, x_s.unsqueeze(-1)).squeeze(-1).clamp(min=_TINY).log()
-
     def loss(self, x0: Tensor, x_t: Tensor, t: Tensor, logits: Tensor, auxiliary: float = 5e-4) -> Tensor:
         """(B, ...) bound of one timestep: KL of the posteriors, or -log p(x_0) at t = 1, plus an auxiliary term.
 
@@ -232,12 +224,6 @@ class CategoricalProcess:
         divergence = (q * (q.clamp(min=_TINY).log() - p.clamp(min=_TINY).log())).sum(dim=-1)
         bound = torch.where(fitted(t.to(x0.device), x0) == 1, cross_entropy, divergence)
         return bound + auxiliary * cross_entropy
-
-
-def sample_categorical(probs: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """One index per row of ``probs`` (..., K), int64."""
-    uniform = torch.rand(probs.shape[:-1], generator=generator, device=probs.device, dtype=probs.dtype)
-    return inverted(probs.cumsum(dim=-1), uniform)
 
 
 def inverted(cumulative: Tensor, uniform: Tensor) -> Tensor:

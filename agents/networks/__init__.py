@@ -1,13 +1,9 @@
 """Denoiser networks."""
 
 from agents.networks.baselines import (
-    DiffuScene,
     DiffuSceneConfig,
-    MiDiffusion,
     MiDiffusionConfig,
-    MixedDiffuScene,
     MixedDiffuSceneConfig,
-    MixedMiDiffusion,
     MixedMiDiffusionConfig,
 )
 from agents.networks.flux import FluxConfig, FluxDenoiser, MixedFlux, MixedFluxConfig
@@ -20,17 +16,13 @@ from agents.networks.registry import (
 from agents.networks.text import TextConfig, TextEncoder
 
 __all__ = [
-    "DiffuScene",
     "DiffuSceneConfig",
     "FluxConfig",
     "FluxDenoiser",
-    "MiDiffusion",
     "MiDiffusionConfig",
-    "MixedDiffuScene",
     "MixedDiffuSceneConfig",
     "MixedFlux",
     "MixedFluxConfig",
-    "MixedMiDiffusion",
     "MixedMiDiffusionConfig",
     "TextConfig",
     "TextEncoder",

@@ -1,7 +1,7 @@
 """Baseline networks: MiDiffusion and DiffuScene, with inputs for slots, time and text and outputs for slots in common.
 
-The *trunk* between inputs and outputs maps tokens (B, N, H), a time embedding (B, H) and text (B, L, H) with its mask
-(B, 1, 1, L), both None without text, to tokens (B, N, H).
+The *trunk* between inputs and outputs maps tokens (B, N, H), a time embedding (B, H) and text (B, L, H) with its
+padding (B, L), both None without text, to tokens (B, N, H).
 
 MiDiffusion (Hu et al. 2024, "Mixed Diffusion for 3D Indoor Scene Synthesis", section on the denoising network) is a
 transformer over the objects of a scene, without positional encoding, whose layer norms are functions of time. The
@@ -15,6 +15,7 @@ the order of slots, although scenes have no order.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -32,7 +33,7 @@ _TIME_WIDTH = 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaselineConfig:
+class BaselineConfig(ABC):
     """Common part of the sizes of all baselines.
 
     Attributes:
@@ -52,6 +53,10 @@ class BaselineConfig:
         if self.hidden % self.heads:
             raise InvalidInputError(f"hidden={self.hidden} is not a multiple of heads={self.heads}")
 
+    @abstractmethod
+    def trunk(self) -> nn.Module:
+        """The trunk with fresh weights."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class MixedBaselineConfig(BaselineConfig):
@@ -64,27 +69,15 @@ class MixedBaselineConfig(BaselineConfig):
     categories: int
 
 
-class Attention(nn.Module):
-    """Multi-head attention of tokens (B, N, H) to ``source`` (B, M, H), which may be the same tokens.
+def attention(hidden: int, heads: int) -> nn.MultiheadAttention:
+    """Attention of torch for tokens (B, N, H)."""
+    return nn.MultiheadAttention(hidden, heads, batch_first=True)
 
-    >>> attention = Attention(hidden=16, heads=2)
-    >>> attention(torch.randn(2, 5, 16), torch.randn(2, 3, 16)).shape
-    torch.Size([2, 5, 16])
-    """
 
-    def __init__(self, hidden: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.query = nn.Linear(hidden, hidden)
-        self.key_value = nn.Linear(hidden, 2 * hidden)
-        self.out = nn.Linear(hidden, hidden)
-
-    def forward(self, tokens: Tensor, source: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Attended (B, N, H); ``mask`` (B, 1, 1, M) is True where to attend."""
-        query = self.query(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-        key, value = self.key_value(source).unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        attended = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
-        return self.out(attended.transpose(1, 2).flatten(-2))
+def attended(layer: nn.MultiheadAttention, tokens: Tensor, source: Tensor, padding: Tensor | None = None) -> Tensor:
+    """Tokens (B, N, H) after attention to ``source`` (B, M, H); ``padding`` (B, M) is True where nothing attends."""
+    result: Tensor = layer(tokens, source, source, key_padding_mask=padding, need_weights=False)[0]
+    return result
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -103,36 +96,42 @@ def head(hidden: int, outputs: int) -> nn.Sequential:
 class _Baseline(nn.Module):
     """A trunk with inputs for time and text."""
 
-    def __init__(self, config: BaselineConfig, trunk: nn.Module) -> None:
+    def __init__(self, config: BaselineConfig) -> None:
         super().__init__()
+        self.trunk = config.trunk()
         self.config = config
         hidden = config.hidden
         self.time_in = mlp(_TIME_WIDTH, hidden, hidden)
         self.text_in = nn.Linear(config.text_width, hidden) if config.text_width else None
-        self.trunk = trunk
 
     def _tokens(self, tokens: Tensor, time: Tensor, text: Tensor | None, text_mask: Tensor | None) -> Tensor:
         """Tokens (B, N, H) through the trunk; ``time`` (B,)."""
         condition = self.time_in(timestep_embedding(time, _TIME_WIDTH).to(tokens.dtype))
         if self.text_in is None:
             return self.trunk(tokens, condition, None, None)
-        mask = None
+        padding = None
         if text is None:
             text = tokens.new_zeros(len(tokens), 1, self.text_in.in_features)
         elif text_mask is not None:
             text = text * text_mask[..., None]
             somewhere = text_mask.any(dim=-1, keepdim=True)
-            mask = (text_mask | ~somewhere)[:, None, None]  # a row of padding alone is read as no text
-        return self.trunk(tokens, condition, self.text_in(text), mask)
+            padding = ~text_mask & somewhere  # a row of padding alone is read as no text
+        return self.trunk(tokens, condition, self.text_in(text), padding)
 
 
 class ContinuousBaseline(_Baseline):
-    """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D), which starts at zero."""
+    """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D), which starts at zero.
 
-    def __init__(self, config: BaselineConfig, features: int, trunk: nn.Module) -> None:
-        super().__init__(config, trunk)
-        self.scene_in = mlp(features, config.hidden, config.hidden)
-        self.scene_out = head(config.hidden, features)
+    >>> network = ContinuousBaseline(DiffuSceneConfig(features=20, hidden=16, heads=2))
+    >>> x = torch.randn(2, 35, 20)
+    >>> network(x, x, torch.tensor([0.1, 0.2])).shape
+    torch.Size([2, 35, 20])
+    """
+
+    def __init__(self, config: Any) -> None:
+        super().__init__(config)
+        self.scene_in = mlp(config.features, config.hidden, config.hidden)
+        self.scene_out = head(config.hidden, config.features)
 
     def forward(self, x: Tensor, position: Tensor, noise_level: Tensor) -> Tensor:
         """Predict from (B, N, D) network input of unit variance and the noise-to-signal ratio (B,), whose logarithm is
@@ -142,10 +141,17 @@ class ContinuousBaseline(_Baseline):
 
 
 class MixedBaseline(_Baseline):
-    """Poses (B, N, 12) and category states (B, N) to a pose output (B, N, 12) and logits (B, N, K), zero at first."""
+    """Poses (B, N, 12) and category states (B, N) to a pose output (B, N, 12) and logits (B, N, K), zero at first.
 
-    def __init__(self, config: MixedBaselineConfig, trunk: nn.Module) -> None:
-        super().__init__(config, trunk)
+    >>> network = MixedBaseline(MixedMiDiffusionConfig(categories=8, hidden=32, depth=2, heads=2, text_width=16))
+    >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
+    >>> out, logits = network(pose, states, torch.tensor([3.0, 7.0]), text=torch.randn(2, 4, 16))
+    >>> out.shape, logits.shape
+    (torch.Size([2, 5, 12]), torch.Size([2, 5, 8]))
+    """
+
+    def __init__(self, config: MixedBaselineConfig) -> None:
+        super().__init__(config)
         hidden = config.hidden
         self.pose_in = mlp(POSE_FEATURES, hidden, hidden)
         self.category_in = nn.Embedding(config.categories + 1, hidden)
@@ -174,10 +180,13 @@ class MixedBaseline(_Baseline):
 class _MiDiffusionSize(BaselineConfig):
     depth: int = 6
 
+    def trunk(self) -> nn.Module:
+        return _Transformer(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class MiDiffusionConfig(_MiDiffusionSize):
-    """Size of a :class:`MiDiffusion`.
+    """Size of MiDiffusion for continuous scenes, permutation-equivariant in the slots.
 
     Further fields are those of :class:`BaselineConfig`.
 
@@ -191,7 +200,7 @@ class MiDiffusionConfig(_MiDiffusionSize):
 
 @dataclass(frozen=True, kw_only=True)
 class MixedMiDiffusionConfig(_MiDiffusionSize, MixedBaselineConfig):
-    """Size of a :class:`MixedMiDiffusion`: that of :class:`MiDiffusionConfig`, and :class:`MixedBaselineConfig`."""
+    """Size of MiDiffusion for mixed scenes: that of :class:`MiDiffusionConfig`, and :class:`MixedBaselineConfig`."""
 
 
 class _AdaptiveNorm(nn.Module):
@@ -216,16 +225,16 @@ class _Block(nn.Module):
         super().__init__()
         hidden = config.hidden
         self.norm, self.feed_norm = _AdaptiveNorm(hidden), _AdaptiveNorm(hidden)
-        self.attention = Attention(hidden, config.heads)
+        self.attention = attention(hidden, config.heads)
         self.text_norm = _AdaptiveNorm(hidden) if config.text_width else None
-        self.text_attention = Attention(hidden, config.heads) if config.text_width else None
+        self.text_attention = attention(hidden, config.heads) if config.text_width else None
         self.feed = mlp(hidden, 4 * hidden, hidden)
 
-    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
         normal = self.norm(tokens, condition)
-        tokens = tokens + self.attention(normal, normal)
+        tokens = tokens + attended(self.attention, normal, normal)
         if self.text_norm is not None and self.text_attention is not None and text is not None:
-            tokens = tokens + self.text_attention(self.text_norm(tokens, condition), text, mask)
+            tokens = tokens + attended(self.text_attention, self.text_norm(tokens, condition), text, padding)
         return tokens + self.feed(self.feed_norm(tokens, condition))
 
 
@@ -236,37 +245,10 @@ class _Transformer(nn.Module):
         super().__init__()
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.depth))
 
-    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
         for block in self.blocks:
-            tokens = block(tokens, condition, text, mask)
+            tokens = block(tokens, condition, text, padding)
         return tokens
-
-
-class MiDiffusion(ContinuousBaseline):
-    """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D); permutation-equivariant in N.
-
-    >>> network = MiDiffusion(MiDiffusionConfig(features=20, hidden=32, depth=2, heads=2))
-    >>> x = torch.randn(2, 34, 20)
-    >>> network(x, x, torch.tensor([0.1, 0.2])).shape
-    torch.Size([2, 34, 20])
-    """
-
-    def __init__(self, config: MiDiffusionConfig) -> None:
-        super().__init__(config, config.features, _Transformer(config))
-
-
-class MixedMiDiffusion(MixedBaseline):
-    """Poses (B, N, 12) and states (B, N) to a pose output (B, N, 12) and logits (B, N, K); permutation-equivariant.
-
-    >>> network = MixedMiDiffusion(MixedMiDiffusionConfig(categories=8, hidden=32, depth=2, heads=2, text_width=16))
-    >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
-    >>> out, logits = network(pose, states, torch.tensor([3.0, 7.0]), text=torch.randn(2, 4, 16))
-    >>> out.shape, logits.shape
-    (torch.Size([2, 5, 12]), torch.Size([2, 5, 8]))
-    """
-
-    def __init__(self, config: MixedMiDiffusionConfig) -> None:
-        super().__init__(config, _Transformer(config))
 
 
 # -- DiffuScene -----------------------------------------------------------------------------------
@@ -278,10 +260,13 @@ class _DiffuSceneSize(BaselineConfig):
     levels: int = 4
     blocks: int = 2
 
+    def trunk(self) -> nn.Module:
+        return _UNet(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class DiffuSceneConfig(_DiffuSceneSize):
-    """Size of a :class:`DiffuScene`.
+    """Size of DiffuScene for continuous scenes, which depends on the order of slots.
 
     Attributes:
         features: D, numbers per slot.
@@ -296,7 +281,7 @@ class DiffuSceneConfig(_DiffuSceneSize):
 
 @dataclass(frozen=True, kw_only=True)
 class MixedDiffuSceneConfig(_DiffuSceneSize, MixedBaselineConfig):
-    """Size of a :class:`MixedDiffuScene`: that of :class:`DiffuSceneConfig`, and :class:`MixedBaselineConfig`."""
+    """Size of DiffuScene for mixed scenes: that of :class:`DiffuSceneConfig`, and :class:`MixedBaselineConfig`."""
 
 
 class _Residual(nn.Module):
@@ -325,16 +310,17 @@ class _Attend(nn.Module):
         super().__init__()
         hidden, heads = config.hidden, config.heads
         self.norm = nn.GroupNorm(heads, hidden)
-        self.attention = Attention(hidden, heads)
+        self.attention = attention(hidden, heads)
         self.text_norm = nn.GroupNorm(heads, hidden) if config.text_width else None
-        self.text_attention = Attention(hidden, heads) if config.text_width else None
+        self.text_attention = attention(hidden, heads) if config.text_width else None
 
-    def forward(self, x: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+    def forward(self, x: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
         """Channels (B, H, N) to the same."""
         normal = self.norm(x).transpose(1, 2)
-        x = x + self.attention(normal, normal).transpose(1, 2)
+        x = x + attended(self.attention, normal, normal).transpose(1, 2)
         if self.text_norm is not None and self.text_attention is not None and text is not None:
-            x = x + self.text_attention(self.text_norm(x).transpose(1, 2), text, mask).transpose(1, 2)
+            normal = self.text_norm(x).transpose(1, 2)
+            x = x + attended(self.text_attention, normal, text, padding).transpose(1, 2)
         return x
 
 
@@ -347,10 +333,10 @@ class _Level(nn.Module):
         self.blocks = nn.ModuleList(_Residual(config, width) for width in widths)
         self.attend = _Attend(config)
 
-    def forward(self, x: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+    def forward(self, x: Tensor, condition: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
         for block in self.blocks:
             x = block(x, condition)
-        return self.attend(x, text, mask)
+        return self.attend(x, text, padding)
 
 
 class _UNet(nn.Module):
@@ -367,47 +353,20 @@ class _UNet(nn.Module):
         self.to_fine = nn.ModuleList(nn.Conv1d(hidden, hidden, 3, padding=1) for _ in range(config.levels - 1))
         self.up = nn.ModuleList(_Level(config, 2 * hidden) for _ in range(config.levels))
 
-    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, mask: Tensor | None) -> Tensor:
+    def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
         x = self.first(tokens.transpose(1, 2))
         skips: list[Tensor] = []
         for index, level in enumerate(self.down):
             x = self.to_coarse[index - 1](x) if index else x
-            x = level(x, condition, text, mask)
+            x = level(x, condition, text, padding)
             skips.append(x)
-        x = self.middle_out(self.middle(self.middle_in(x, condition), text, mask), condition)
+        x = self.middle_out(self.middle(self.middle_in(x, condition), text, padding), condition)
         for index, level in enumerate(self.up):
             skip = skips.pop()
             if index:
                 x = self.to_fine[index - 1](x.repeat_interleave(2, dim=-1)[..., : skip.shape[-1]])
-            x = level(torch.cat([x, skip], dim=1), condition, text, mask)
+            x = level(torch.cat([x, skip], dim=1), condition, text, padding)
         return x.transpose(1, 2)
-
-
-class DiffuScene(ContinuousBaseline):
-    """Scenes (B, N, D) at a noise level (B,) to a prediction (B, N, D); depends on the order of slots.
-
-    >>> network = DiffuScene(DiffuSceneConfig(features=20, hidden=16, heads=2))
-    >>> x = torch.randn(2, 35, 20)
-    >>> network(x, x, torch.tensor([0.1, 0.2])).shape
-    torch.Size([2, 35, 20])
-    """
-
-    def __init__(self, config: DiffuSceneConfig) -> None:
-        super().__init__(config, config.features, _UNet(config))
-
-
-class MixedDiffuScene(MixedBaseline):
-    """Poses (B, N, 12) and states (B, N) to a pose output (B, N, 12) and logits (B, N, K); depends on slot order.
-
-    >>> network = MixedDiffuScene(MixedDiffuSceneConfig(categories=8, hidden=16, heads=2, text_width=16))
-    >>> pose, states = torch.randn(2, 5, 12), torch.randint(9, (2, 5))
-    >>> out, logits = network(pose, states, torch.tensor([3.0, 7.0]), text=torch.randn(2, 4, 16))
-    >>> out.shape, logits.shape
-    (torch.Size([2, 5, 12]), torch.Size([2, 5, 8]))
-    """
-
-    def __init__(self, config: MixedDiffuSceneConfig) -> None:
-        super().__init__(config, _UNet(config))
 
 
 # -- registration ---------------------------------------------------------------------------------
@@ -417,7 +376,7 @@ def _diffuscene(keys: Mapping[str, Any]) -> dict[str, Any]:
     return {**{name: keys[name] for name in ("hidden", "heads", "text_width")}, "blocks": max(1, keys["depth"] // 3)}
 
 
-register_network("midiffusion", "continuous", MiDiffusionConfig, MiDiffusion)
-register_network("midiffusion", "mixed", MixedMiDiffusionConfig, MixedMiDiffusion)
-register_network("diffuscene", "continuous", DiffuSceneConfig, DiffuScene, sizes=_diffuscene)
-register_network("diffuscene", "mixed", MixedDiffuSceneConfig, MixedDiffuScene, sizes=_diffuscene)
+register_network("midiffusion", "continuous", MiDiffusionConfig, ContinuousBaseline)
+register_network("midiffusion", "mixed", MixedMiDiffusionConfig, MixedBaseline)
+register_network("diffuscene", "continuous", DiffuSceneConfig, ContinuousBaseline, sizes=_diffuscene)
+register_network("diffuscene", "mixed", MixedDiffuSceneConfig, MixedBaseline, sizes=_diffuscene)

@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from agents.diffusion import CategoricalProcess, GaussianProcess
-from agents.diffusion.categorical import one_hot
 from agents.diffusion.gaussian import Moments
 from agents.diffusion.reverse_steps import state_of
 from agents.networks.text import Text, TextEncoder
@@ -110,7 +110,7 @@ class Replays:
     def run(self, network: nn.Module, *inputs: Tensor, **named: Tensor | None) -> Any:
         """``network(*inputs, **named)``: a tensor or a tuple of tensors."""
         if inputs[0].device.type != self._on or self._fails or torch.is_grad_enabled():
-            return network(*inputs, **named)
+            return _plain(network, *inputs, **named)
         given = [*inputs, *named.values()]
         layout = tuple((value.shape, value.dtype) if isinstance(value, Tensor) else value for value in given)
         weights = tuple(weight.data_ptr() for weight in network.parameters())
@@ -126,17 +126,17 @@ class Replays:
                 known + 1 < _CAPTURED_AT
                 or sum(not isinstance(entry, int) for entry in self._known.values()) >= _MAX_GRAPHS
             ):
-                return network(*inputs, **named)
+                return _plain(network, *inputs, **named)
             known = self._captured(network, inputs, named)
             if known is None:
-                return network(*inputs, **named)
+                return _plain(network, *inputs, **named)
             self._known[key] = known
         kept, replay, outputs = known
         for place, value in zip(kept, given, strict=True):
             if isinstance(value, Tensor):
                 place.copy_(value)
         replay()
-        return outputs.clone() if isinstance(outputs, Tensor) else tuple(output.clone() for output in outputs)
+        return _copied(outputs)
 
     def _captured(self, network: nn.Module, inputs: Sequence[Tensor], named: dict[str, Tensor | None]) -> Any:
         """Inputs, replay and outputs of a captured call; None if it cannot be captured."""
@@ -159,13 +159,29 @@ class Replays:
         return [*own, *others.values()], replay, outputs
 
 
+def _plain(network: nn.Module, *inputs: Tensor, **named: Tensor | None) -> Any:
+    """A call that is not captured; without gradients in inference mode, in which operations do less beside their work.
+
+    The outputs are copied, so that they may be used where gradients are recorded.
+    """
+    if torch.is_grad_enabled():
+        return network(*inputs, **named)
+    with torch.inference_mode():
+        outputs = network(*inputs, **named)
+    return _copied(outputs)
+
+
+def _copied(outputs: Any) -> Any:
+    return outputs.clone() if isinstance(outputs, Tensor) else tuple(output.clone() for output in outputs)
+
+
 def autocast(like: Tensor, precision: torch.dtype) -> torch.autocast:
     """The context in which a network runs in ``precision`` on the device of ``like``; does nothing for float32."""
     return torch.autocast(like.device.type, precision, enabled=precision != torch.float32)
 
 
-class Denoiser(nn.Module):
-    """A network together with its process: x_t (B, N, D) and t (B,) to the denoised scene x_0 (B, N, D).
+class _Denoiser(nn.Module):
+    """A network together with the process of its continuous numbers.
 
     Attributes:
         precision: number format of the network in training (``torch.bfloat16`` for autocast); the chain is always
@@ -180,13 +196,27 @@ class Denoiser(nn.Module):
         self.precision, self.chain_precision = torch.float32, "float32"
         self.replays = Replays()
 
+    def noise_levels(self, t: Tensor | int, like: Tensor) -> Tensor:
+        """(B,) noise-to-signal ratio of scenes ``like`` (B, N, D) at ``t``, and the network told what precision its
+        blocks have there: that of chains at one noisy timestep.
+        """
+        network: Any = self.network
+        if hasattr(network, "body_precision"):
+            noisy = isinstance(t, int) and float(self.process.sigma[t]) > _FINE * float(self.process.alpha[t])
+            network.body_precision = self.chain_precision if noisy else "float32"
+        alpha, sigma = self.process.rates(t, like)
+        ratio = sigma / alpha
+        return ratio.reshape(t.shape) if isinstance(t, Tensor) else ratio.expand(len(like))
+
+
+class Denoiser(_Denoiser):
+    """x_t (B, N, D) and t (B,) to the denoised scene x_0 (B, N, D)."""
+
     def output(self, x_t: Tensor, t: Tensor | int) -> Tensor:
         """The raw network output (B, N, D), in the units of ``process.target``."""
         process = self.process
         alpha, _ = process.rates(t, x_t)
-        level = noise_levels(process, t, x_t)
-        set_precision(self, process, t)
-        inputs = process.network_input(x_t, t), x_t / alpha, level
+        inputs = process.network_input(x_t, t), x_t / alpha, self.noise_levels(t, x_t)
         with autocast(x_t, self.precision):
             results = [
                 self.replays.run(self.network, *(value[rows] for value in inputs)) for rows in parts_of(*x_t.shape[:2])
@@ -196,20 +226,6 @@ class Denoiser(nn.Module):
     def forward(self, x_t: Tensor, t: Tensor | int) -> Tensor:
         """The denoised scene x_0 (B, N, D), normalised; ``t`` (B,), or one timestep of all scenes."""
         return self.process.x0_from_output(x_t, t, self.output(x_t, t))
-
-
-def noise_levels(process: GaussianProcess, t: Tensor | int, like: Tensor) -> Tensor:
-    """(B,) noise-to-signal ratio of scenes ``like`` (B, N, D) at ``t``."""
-    alpha, sigma = process.rates(t, like)
-    ratio = sigma / alpha
-    return ratio.reshape(t.shape) if isinstance(t, Tensor) else ratio.expand(len(like))
-
-
-def set_precision(denoiser: Any, process: GaussianProcess, t: Tensor | int) -> None:
-    """Tell the network of a denoiser the precision of its blocks at ``t``: that of chains at one noisy timestep."""
-    if hasattr(denoiser.network, "body_precision"):
-        noisy = isinstance(t, int) and float(process.sigma[t]) > _FINE * float(process.alpha[t])
-        denoiser.network.body_precision = denoiser.chain_precision if noisy else "float32"
 
 
 _PAIRS = 2**20
@@ -262,14 +278,8 @@ class Observed:
         return torch.where(self.entries(), self.x, x)
 
 
-class MixedDenoiser(nn.Module):
-    """x_t (B, N, 12 + K) and t (B,) to the clean pose (B, N, 12) and logits of the clean category (B, N, K).
-
-    Attributes:
-        precision: number format of the network in training (``torch.bfloat16`` for autocast); chains are always
-            float32.
-        chain_precision: number format of the blocks in a chain, see :meth:`ScenePrior.with_precision`.
-    """
+class MixedDenoiser(_Denoiser):
+    """x_t (B, N, 12 + K) and t (B,) to the clean pose (B, N, 12) and logits of the clean category (B, N, K)."""
 
     def __init__(
         self,
@@ -279,7 +289,7 @@ class MixedDenoiser(nn.Module):
         text_encoder: TextEncoder | BertEncoder | None,
         empty_slots: str,
     ) -> None:
-        super().__init__()
+        super().__init__(network, poses)
         if empty_slots not in EMPTY_SLOTS:
             raise unknown_name("treatment of empty slots", empty_slots, EMPTY_SLOTS)
         self.drops_empty = empty_slots == "dropped"
@@ -292,14 +302,13 @@ class MixedDenoiser(nn.Module):
         mean, std = (None, None) if by_category is None else by_category.given_state(categories)
         self._mean: Tensor | None
         self._std: Tensor | None
+        self._certain: Tensor
+        certain = _CERTAIN * (torch.eye(categories.categories + 1, categories.categories) - 1.0)
+        self.register_buffer("_certain", certain, persistent=False)
         self.register_buffer("_mean", mean, persistent=False)
         self.register_buffer("_std", std, persistent=False)
-        self.network = network
         self.reads_log_noise = getattr(network.config, "time_input", "timestep") == "log_noise"
-        self.precision, self.chain_precision = torch.float32, "float32"
-        self.replays = Replays()
         self.text_encoder = text_encoder
-        self.poses = poses
         self.categories = categories
 
     def groups_by_number(self, text: Text) -> Tensor | None:
@@ -319,7 +328,7 @@ class MixedDenoiser(nn.Module):
     def output(
         self, x_t: Tensor, t: Tensor | int, observed: Observed | None = None, text: Text | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The raw pose output, in the units of ``poses.target``, and logits.
+        """The raw pose output, in the units of ``process.target``, and logits.
 
         Args:
             x_t: (B, N, 12 + K), observed entries in place.
@@ -328,27 +337,25 @@ class MixedDenoiser(nn.Module):
             text: (B, L, W) tokens and (B, L) their mask.
         """
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
-        alpha, _ = self.poses.rates(t, pose)
-        ratio = noise_levels(self.poses, t, x_t)
+        alpha, _ = self.process.rates(t, pose)
+        ratio = self.noise_levels(t, x_t)
         level = ratio[:, None].expand(pose.shape[:2])
-        scaled = self.poses.network_input(pose, t)
+        scaled = self.process.network_input(pose, t)
         position = pose / alpha
         if observed is not None:
             exact = observed.pose[..., None]
             scaled = torch.where(
-                exact, self.poses.network_input(pose, torch.zeros_like(t) if isinstance(t, Tensor) else 0), scaled
+                exact, self.process.network_input(pose, torch.zeros_like(t) if isinstance(t, Tensor) else 0), scaled
             )
             position = torch.where(exact, pose, position)
             level = torch.where(observed.pose, torch.zeros_like(level), level)
         steps = t if isinstance(t, Tensor) else torch.full((len(pose),), t, device=pose.device)
         time = 250.0 * ratio.log() if self.reads_log_noise else (steps - 1).to(pose.dtype)
         inputs = [scaled, states, position, level, *([] if observed is None else [observed.flags()])]
-        set_precision(self, self.poses, t)
         if self.drops_empty:
             output, logits = self._on_present(inputs, time, text)
-            count = self.categories.categories
-            certain = _CERTAIN * (one_hot(states, count, logits.dtype) - 1.0)
-            return output, torch.where((states < count)[..., None], certain, logits)
+            certain = F.embedding(states, self._certain).to(logits)
+            return output, torch.where((states < self.categories.categories)[..., None], certain, logits)
         results = []
         for rows in parts_of(*pose.shape[:2]):
             words = None if text is None else (text[0][rows], text[1][rows])
@@ -387,14 +394,14 @@ class MixedDenoiser(nn.Module):
         """The clean pose (B, N, 12), normalised, and the logits of the clean category (B, N, K)."""
         output, logits = self.output(x_t, t, observed, text)
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
-        if isinstance(t, Tensor) or self._mean is None or self._std is None or self.poses.prediction != "edm":
+        if isinstance(t, Tensor) or self._mean is None or self._std is None or self.process.prediction != "edm":
             moments = self.moments(states, t) if isinstance(t, Tensor) else None
-            return self.poses.x0_from_output(pose, t, output, moments), logits
+            return self.process.x0_from_output(pose, t, output, moments), logits
         of_states = self._mean[t], self._std[t]
-        tables = self.poses.once(
-            t, pose, "states", lambda: (torch.stack(self.poses.output_scaling(t, pose, of_states), 1),)
+        tables = self.process.once(
+            t, pose, "states", lambda: (torch.stack(self.process.output_scaling(t, pose, of_states), 1),)
         )
-        return self.poses.x0_from_output(pose, t, output, None, tables[0][states].unbind(-2)), logits
+        return self.process.x0_from_output(pose, t, output, None, tables[0][states].unbind(-2)), logits
 
 
 # -- packing: slots that are known to be empty are left out of a batch ----------------------------
@@ -437,14 +444,11 @@ def run_packed(
         run: function of rows, index and mask of :func:`pack` that gives two tensors (b, M, W).
         widths: W of the two outputs.
     """
-    parts: list[list[Tensor]] = []
-    order: list[Tensor] = []
+    parts, order = [], []
     for rows, index, mask in pack(active):
+        values = torch.cat(run(rows, index, mask), dim=-1).mul_(mask[..., None])
+        blank = values.new_zeros(len(values), active.shape[1], sum(widths))
+        parts.append(blank.scatter_(1, index[..., None].expand_as(values), values))
         order.append(rows)
-        parts.append([])
-        for values, width in zip(run(rows, index, mask), widths, strict=True):
-            blank = values.new_zeros(len(values), active.shape[1], width)
-            parts[-1].append(blank.scatter(1, index[..., None].expand(-1, -1, width), values * mask[..., None]))
-    back = torch.argsort(torch.cat(order))
-    first, second = (torch.cat(side)[back] for side in zip(*parts, strict=True))
+    first, second = torch.cat(parts)[torch.argsort(torch.cat(order))].split(widths, dim=-1)
     return first, second

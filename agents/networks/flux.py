@@ -53,8 +53,9 @@ class _Gelu(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor) -> Tensor:
         if ctx is not None:
             ctx.save_for_backward(x)
-        inner = torch.addcmul(x, x * x, x, value=0.044715).mul_(math.sqrt(2.0 / math.pi)).tanh_()
-        return torch.addcmul(x, x, inner).mul_(0.5)
+        inner = x * x
+        torch.addcmul(x, inner, x, value=0.044715, out=inner).mul_(math.sqrt(2.0 / math.pi)).tanh_()
+        return torch.addcmul(x, x, inner, out=inner).mul_(0.5)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
@@ -501,7 +502,8 @@ class MixedFlux(nn.Module):
         tokens = self._add(tokens, lambda module: module.messages(scene))
         text = pose.new_zeros(len(pose), 1, self.config.text_width) if text is None else text
         words = None if self.text_in is None else self.text_in(text)
-        tokens = self._attend(tokens, words, condition, text_mask, biases, scene)
+        with products_in(self.body_precision, tokens):
+            tokens = self._attend(tokens, words, condition, text_mask, biases, scene).to(tokens.dtype)
         shift, scale = self.final_modulation(condition).unsqueeze(1).chunk(2, dim=-1)
         features = self.final((1 + scale) * F.layer_norm(tokens, (self.config.hidden,), eps=1e-6) + shift)
         logits = self._add(self.logits_out(features), lambda module: module.logits(scene))
@@ -526,16 +528,10 @@ class MixedFlux(nn.Module):
         self, slots: Tensor, words: Tensor | None, condition: Tensor, text_mask: Tensor | None,
         biases: Tensor | None, scene: Scene,
     ) -> Tensor:  # fmt: skip
-        """Slots (B, N, H) and words (B, L, H) through all blocks to slots (B, N, H), in ``body_precision``."""
-        with products_in(self.body_precision, slots):
-            return self._blocks(slots, words, condition, text_mask, biases, scene).to(slots.dtype)
-
-    def _blocks(
-        self, slots: Tensor, words: Tensor | None, condition: Tensor, text_mask: Tensor | None,
-        biases: Tensor | None, scene: Scene,
-    ) -> Tensor:  # fmt: skip
+        """Slots (B, N, H) and words (B, L, H) through all blocks to slots (B, N, H)."""
         if biases is not None and scene.slot_mask is not None:  # once for all blocks
-            biases = biases.masked_fill_(~scene.slot_mask[:, None, None], -torch.inf)
+            absent = torch.zeros_like(scene.slot_mask, dtype=biases.dtype).masked_fill_(~scene.slot_mask, -torch.inf)
+            biases = biases.add_(absent[:, None, None])
         chosen: Iterator[Tensor | None] = itertools.repeat(None) if biases is None else iter(biases)
         reaches = words is not None and self.config.text_reach == "all"
         if words is not None:
@@ -614,7 +610,8 @@ def _mask(
     bias: Tensor | None, text_mask: Tensor | None, slot_mask: Tensor | None, count: int, slots: Tensor,
     asks: bool = True,
 ) -> Tensor | None:  # fmt: skip
-    """Mask of attention over ``count`` = L words, then N slots, for words and slots, or slots alone; None for none.
+    """Mask of attention over ``count`` = L words, then N slots, for words and slots, or slots alone: float with
+    ``bias``, else (B, 1, 1, L + N) bool; None where nothing is masked.
 
     Args:
         bias: (B, heads, N, N) of the slots, -inf on padding; None without relations.
@@ -632,11 +629,6 @@ def _mask(
         if count and asks and slot_mask is not None:
             bias[..., :count, count:].masked_fill_(~slot_mask[:, None, None], -torch.inf)
         return bias
-    return _where_to_attend(text_mask, slot_mask, count, slots)
-
-
-def _where_to_attend(text_mask: Tensor | None, slot_mask: Tensor | None, count: int, slots: Tensor) -> Tensor | None:
-    """(B, 1, 1, L + N) bool over ``count`` = L text tokens, then N slots; None where nothing is masked."""
     if text_mask is None and slot_mask is None:
         return None
     everywhere = torch.ones(len(slots), count + slots.shape[1], dtype=torch.bool, device=slots.device)

@@ -16,8 +16,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.diffusion.categorical import one_hot
-
 Place = Literal["slots", "condition", "attention", "output"]
 """The part of the core after which the weights of a module are drawn, so that a seed keeps giving the same weights."""
 
@@ -227,10 +225,8 @@ def count_states(states: Tensor, categories: int, slot_mask: Tensor | None = Non
     >>> count_states(torch.tensor([[0, 0, 1, 2, 3, 3]]), 3).tolist()
     [[2.0, 1.0, 2.0]]
     """
-    counted = one_hot(states, categories + 1, torch.float32)
-    if slot_mask is not None:
-        counted = counted * slot_mask[..., None]
-    counts = counted.sum(dim=1)
+    seen = torch.ones_like(states, dtype=torch.float32) if slot_mask is None else slot_mask.float()
+    counts = seen.new_zeros(len(states), categories + 1).scatter_add_(1, states, seen)
     return torch.cat([counts[:, : categories - 1], counts[:, categories:]], dim=1)
 
 

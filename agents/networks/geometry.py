@@ -89,8 +89,8 @@ class RotationFeatures(FluxModule):
         return F.pad(off.index_add(-1, constant_on(_TILTS, off.device), tilt), (3, 0))
 
 
-_SQUARINGS = 12
-"""Squarings of the matrix of a quaternion, whose largest eigenvalue is then the only one that is left."""
+_POWER = 64
+"""Power of the matrix of a quaternion, taken twice: its largest eigenvalue is then the only one that is left."""
 
 
 @torch.no_grad()
@@ -111,8 +111,8 @@ def nearest_rotations(rotation: Tensor) -> Tensor:
         square = square / (2.0 * torch.linalg.matrix_norm(wide).flatten()[:, None, None] + 1e-9)
         square.diagonal(dim1=-2, dim2=-1).add_(0.9)  # positive
         square[:, 0, 0] += 1e-14
-        for _ in range(_SQUARINGS):
-            square = square @ square
+        for _ in range(2):  # the trace is at least 1/4 of the square of the former one, so that doubles suffice
+            square = torch.linalg.matrix_power(square, _POWER)
             square = square / square.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[:, None, None]
         best = square.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
         quaternion = square.gather(-1, best[:, None, None].expand(-1, 4, 1)).view(*wide.shape[:-2], 4)
@@ -193,15 +193,16 @@ def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
         noise: (B, N, 3) standard deviation of the noise on them along x, y, z, metres; (B, N, 1) if equal for all axes.
         scales: (8,) lengths, metres.
     """
-    place, variance = metres.movedim(-1, 0), noise.movedim(-1, 0).square()
+    place, variance = metres.movedim(-1, 0).contiguous(), noise.movedim(-1, 0).contiguous().square()
     wide = scales.square().view(-1, 1, 1, 1)
     x, y, z = (place.unsqueeze(-1) - place.unsqueeze(-2)).split(1)  # (1, B, N, N)
     blurs = (variance.unsqueeze(-1) + variance.unsqueeze(-2)).split(1)
     along_x, along_y, along_z = [blur + wide for blur in blurs] if len(blurs) == 3 else [blurs[0] + wide] * 3  # (8, ...
     xx, yy, zz = x.square(), y.square(), z.square()
+    halves = [-0.5 * square for square in (xx, yy, zz)]
     reach_x = (xx + yy + along_x).sqrt()
     reach_y = reach_x if along_y is along_x else (xx + yy + along_y).sqrt()
-    parts = [_gaussian(xx / along_x + yy / along_y), _gaussian(zz / along_z)]
+    parts = [_gaussian((halves[0] / along_x).add_(halves[1] / along_y)), _gaussian(halves[2] / along_z)]
     return torch.cat([*parts, z / (zz + along_z).sqrt(), x / reach_x, y / reach_y]).movedim(0, -1)
 
 
@@ -209,9 +210,11 @@ _LEAST = -60.0
 """Least exponent of a feature."""
 
 
-def _gaussian(squares: Tensor) -> Tensor:
-    """exp(-x / 2), at least 1e-26: products of numbers below 1e-38 take a processor many times as long as others."""
-    return torch.exp((-0.5 * squares).clamp_(min=_LEAST))
+def _gaussian(exponent: Tensor) -> Tensor:
+    """exp(x), at least 1e-26: products of numbers below 1e-38 take a processor many times as long as others. Overwrites
+    ``exponent``.
+    """
+    return exponent.clamp_(min=_LEAST).exp_()
 
 
 def linear_of_pairs(layer: nn.Linear, pairs: Tensor) -> Tensor:
@@ -285,16 +288,18 @@ def joint_attention(
     """
     if relations is None or gathered is None or mask is None:
         return F.scaled_dot_product_attention(query, key, value, attn_mask=mask).transpose(1, 2).flatten(-2)
-    scores = torch.baddbmm(
-        mask.expand(*query.shape[:-1], -1).flatten(0, 1), query.flatten(0, 1), key.flatten(0, 1).mT,
-        alpha=query.shape[-1] ** -0.5,
-    )  # fmt: skip
-    weights = scores.softmax(dim=-1)
-    attended = (weights @ value.flatten(0, 1)).unflatten(0, query.shape[:2]).transpose(1, 2).flatten(-2)
-    slots = relations.shape[1]
-    among = weights.unflatten(0, query.shape[:2])[:, :, -slots:, -slots:].transpose(1, 2)  # (B, N, heads, N)
-    message = gathered((among @ relations).flatten(-2))
-    others = attended.shape[1] - slots
+    batch, heads, asking, width = query.shape
+    asked, slots, features = key.shape[2], *relations.shape[2:]
+    weights = torch.baddbmm(
+        mask.expand(batch, heads, asking, asked).reshape(-1, asking, asked), query.reshape(-1, asking, width),
+        key.reshape(-1, asked, width).mT, alpha=width**-0.5,
+    ).softmax(dim=-1)  # fmt: skip
+    attended = torch.bmm(weights, value.reshape(-1, asked, width)).view(batch, heads, asking, width)
+    attended = attended.transpose(1, 2).reshape(batch, asking, -1)
+    among = weights.view(batch, heads, asking, asked)[:, :, -slots:, -slots:].transpose(1, 2)  # (B, N, heads, N)
+    message = torch.bmm(among.reshape(-1, heads, slots), relations.reshape(-1, slots, features))
+    message = gathered(message.view(batch, slots, -1))
+    others = asking - slots
     return attended + (F.pad(message, (0, 0, others, 0)) if others else message)
 
 
@@ -402,10 +407,10 @@ class Contacts(FluxModule):
             features: (B, N, N, F) of pairs of slots.
             slot_mask: (B, N) bool, False for padding slots, which nothing may see; None where there are none.
         """
-        place, spread = metres.movedim(-1, 0), noise.movedim(-1, 0).square()
+        place, spread = metres.movedim(-1, 0).contiguous(), noise.movedim(-1, 0).contiguous().square()
         offset = place.unsqueeze(-1) - place.unsqueeze(-2)  # (3, B, N, N) from j to i
         variance = spread.unsqueeze(-1) + (spread + _MIN_NOISE**2).unsqueeze(-2)
-        turns = rotation.movedim((-2, -1), (0, 1))
+        turns = rotation.movedim((-2, -1), (0, 1)).contiguous()  # rows of slots j are then read at once
         mine, theirs = turns.unsqueeze(-1), turns.unsqueeze(-2)  # (3, 3, B, N, 1) of i, (3, 3, B, 1, N) of j
         squared = offset[:2].square()
         sideways = (squared[:1] + squared[1:] + 1e-12).sqrt()
@@ -420,7 +425,7 @@ class Contacts(FluxModule):
         sign = along / torch.hypot(along, both)
         aside = toward * sign[:1]
         kinds = self.kind(states)
-        own, other = (layer(kinds).movedim(-1, 0) for layer in (self.own, self.other))  # (2 W, B, N)
+        own, other = (layer(kinds).movedim(-1, 0).contiguous() for layer in (self.own, self.other))  # (2 W, B, N)
         own = own + torch.cat([self.seen.bias, self.weigh.bias])[:, None, None]
         (early, late), (early_other, late_other) = own.unsqueeze(-1).chunk(2), other.unsqueeze(-2).chunk(2)
         here = _turned(aside, mine[:2])  # the direction from j to i in the frame of i, and from i to j in that of j
@@ -434,15 +439,15 @@ class Contacts(FluxModule):
         gaps = level.flatten(1).addmm_(last.weight, offered, alpha=-_TYPICAL).unflatten(1, shape) / both
         bounded = gaps / (1.0 + (gaps / _GAP_REACH).square()).sqrt()
         steps = (-2.0 * gaps).clamp_(min=_LEAST).sigmoid()
-        weighed = _product(self.weigh.weight, seen, bounded, steps, _gaussian(gaps.square()), both[:1].log())
+        weighed = _product(self.weigh.weight, seen, bounded, steps, _gaussian(-0.5 * gaps.square()), both[:1].log())
         weighed = F.silu(weighed.unflatten(1, shape).add_(late).add_(late_other), fresh)
         weighed = F.silu(linear_of_pairs(self.second, weighed), fresh)
-        sign = sign / both
-        parts = [aside / both[:1], sign[1:5], sign[5:, None] * theirs.transpose(0, 1)]
-        parts += [part * gap for part, gap in zip(parts, (bounded[:1], bounded[1:5], bounded[5:, None]), strict=True)]
         present = (1.0 - torch.eye(states.shape[1], dtype=both.dtype, device=both.device)).expand_as(both[0])
         present = present if slot_mask is None else present * slot_mask.unsqueeze(1)
-        ways = torch.cat([*(part.reshape(-1, *shape) for part in parts), present.unsqueeze(0)]).mul_(present)
+        sign, aside = sign / both * present, aside * present
+        parts = [aside / both[:1], sign[1:5], sign[5:, None] * turns.transpose(0, 1).contiguous().unsqueeze(-2)]
+        parts += [part * gap for part, gap in zip(parts, (bounded[:1], bounded[1:5], bounded[5:, None]), strict=True)]
+        ways = torch.cat([*(part.reshape(-1, *shape) for part in parts), present.unsqueeze(0)])
         gathered = weighed.movedim(0, -2) @ ways.permute(1, 2, 3, 0)  # (B, N, W, 2 * 15 + 1), summed over other slots
         moves = self._displacements(gathered[..., :-1], ways[:-1].sum(dim=-1).movedim(0, -1), rotation)
         moves = math.sqrt(2) * noise.unsqueeze(-2) * moves

@@ -83,9 +83,9 @@ def list_networks(process: str) -> list[str]:
 def build_network(config: NetworkConfig) -> nn.Module:
     """A network with fresh weights; an InvalidInputError if ``config`` is not the configuration of a network.
 
-    >>> from agents.networks import MiDiffusionConfig
-    >>> type(build_network(MiDiffusionConfig(features=20, hidden=32, depth=1))).__name__
-    'MiDiffusion'
+    >>> from agents.networks import FluxConfig
+    >>> type(build_network(FluxConfig(features=20, hidden=32, depth=1, heads=2))).__name__
+    'FluxDenoiser'
     """
     return _entry_of(config).network(config)
 

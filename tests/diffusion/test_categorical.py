@@ -8,8 +8,8 @@ import torch
 from agents.diffusion.categorical import (
     CATEGORICAL_KERNELS,
     CategoricalProcess,
+    inverted,
     make_categorical_schedule,
-    sample_categorical,
 )
 from agents.diffusion.gaussian import StepTable
 from scene_envs.errors import InvalidInputError, UnknownNameError
@@ -119,7 +119,8 @@ def test_noise_is_drawn_from_the_marginal() -> None:
     process = _process("mask_and_replace", 100)
     x0 = torch.full((40_000,), 2)
     t = torch.full((40_000,), 50)
-    drawn = process.add_noise(x0, t, torch.Generator().manual_seed(0)).bincount(minlength=K + 1) / 40_000
+    uniform = torch.rand(40_000, generator=torch.Generator().manual_seed(0))
+    drawn = inverted(process.marginal(x0, t).cumsum(-1), uniform).bincount(minlength=K + 1) / 40_000
     expected = process.marginal(x0[:1], t[:1])[0]
     torch.testing.assert_close(drawn, expected, atol=0.01, rtol=0)
     torch.testing.assert_close(expected.double(), process.transition(0, 50)[2], atol=1e-6, rtol=0)
@@ -127,7 +128,8 @@ def test_noise_is_drawn_from_the_marginal() -> None:
 
 def test_sampling_follows_probabilities_and_never_draws_impossible_ones() -> None:
     probs = torch.tensor([0.0, 0.25, 0.0, 0.75, 0.0]).expand(8000, 5)
-    counts = sample_categorical(probs, torch.Generator().manual_seed(1)).bincount(minlength=5)
+    uniform = torch.rand(8000, generator=torch.Generator().manual_seed(1))
+    counts = inverted(probs.cumsum(-1), uniform).bincount(minlength=5)
     assert counts[[0, 2, 4]].sum() == 0
     assert float(counts[1]) / 8000 == pytest.approx(0.25, abs=0.02)
 
@@ -138,7 +140,7 @@ def test_the_loss_is_smallest_at_the_truth_and_gradients_are_finite(name: str) -
     generator = torch.Generator().manual_seed(0)
     x0 = torch.randint(K, (16, 3), generator=generator)
     t = torch.arange(1, 17)
-    x_t = process.add_noise(x0, t, generator)
+    x_t = inverted(process.marginal(x0, t).cumsum(-1), torch.rand(16, 3, generator=generator))
     logits = torch.zeros(16, 3, K, requires_grad=True)
     loss = process.loss(x0, x_t, t, logits)
     loss.sum().backward()

@@ -18,6 +18,7 @@ from agents.networks.denoisers import Replays, check_precision, parts_of, produc
 from agents.networks.flux import gelu
 from agents.networks.geometry import nearest_rotations
 from agents.priors.testing import tiny_prior
+from scene_envs.arrays import constant_on
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 
@@ -207,3 +208,31 @@ def test_nearest_rotations_are_those_of_an_svd() -> None:
         torch.testing.assert_close(nearest_rotations(noisy), u @ vt, atol=1e-9, rtol=0)
     nothing = torch.full((1, 2, 3, 3), torch.nan)
     torch.testing.assert_close(nearest_rotations(nothing), torch.eye(3).expand(1, 2, 3, 3))
+
+
+class Asking(nn.Module):
+    """Doubles its input, and keeps whether it was called in inference mode."""
+
+    modes: list[bool]
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.modes.append(torch.is_inference_mode_enabled())
+        return 2.0 * x
+
+
+def test_calls_without_gradients_are_in_inference_mode_and_their_outputs_serve_where_gradients_are_recorded() -> None:
+    network, replays, factor = Asking(), Replays(), torch.ones(3, requires_grad=True)
+    network.modes = []
+    with torch.no_grad():
+        found = replays.run(network, torch.ones(3))
+    (factor * found).sum().backward()
+    assert factor.grad is not None
+    assert factor.grad.tolist() == [2.0, 2.0, 2.0]
+    assert replays.run(network, factor).requires_grad
+    assert network.modes == [True, False]
+
+
+def test_constants_that_move_to_a_device_in_inference_mode_serve_where_gradients_are_recorded() -> None:
+    with torch.inference_mode():
+        moved = constant_on(torch.ones(2), torch.device("meta"))
+    assert not moved.is_inference()
