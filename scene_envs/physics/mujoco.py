@@ -25,13 +25,14 @@ from scene_envs.physics.parts import (
     quaternions,
     times,
 )
-from scene_envs.physics.placement import Objects
+from scene_envs.physics.placement import Objects, boxes_meet
 
 TIMESTEP = 0.002
 """Length of a step, s, also in exported MJCF files."""
-SOLREF, SOLIMP = (0.004, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)
-"""Stiffness of all contacts, also in exported MJCF files, as large as the step allows: objects at rest sink by
-micrometres, instead of 0.1 mm with MuJoCo's defaults."""
+SOLREF, SOLIMP = (0.004, 1.6), (0.98, 0.99, 0.001, 0.5, 2.0)
+"""Softness of all contacts, also in exported MJCF files. Objects at rest sink by micrometres, instead of 0.1 mm with
+MuJoCo's defaults. Contacts are damped more than critically, so that overlaps within the limits close in 20 ms, as in
+Bullet: with critical damping they close in 4 ms, and the objects hop."""
 _LOOK = 12
 """Number of steps between checks for rest."""
 _STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
@@ -282,9 +283,11 @@ class Overlaps:
         count = len(parts)
         self._position, self._radius = model.geom_pos[:count].copy(), model.geom_rbound[:count].copy()
         self._rotation = matrices(np.roll(model.geom_quat[:count], -1, axis=1))
-        box = model.geom_aabb[:count]
-        self._middle = self._position + apply(self._rotation, box[:, :3])  # (P, 3) m, of the box of each part
-        self._axes = self._rotation * (box[:, None, 3:] + 2.0 * _SAME)  # (P, 3, 3) m, its half axes, columns
+        inner = [corners @ turn for corners, turn in zip(parts, self._rotation, strict=True)]
+        low, high = (np.stack([side(corners, axis=0) for corners in inner]) for side in (np.min, np.max))
+        self._middle = apply(self._rotation, 0.5 * (low + high))  # (P, 3) m, of the box of each part
+        # (P, 3, 3) m, its half axes, columns; no two parts overlap deeper than their boxes do
+        self._axes = 0.5 * self._rotation * (high - low - _ROUNDING)[:, None]
         sizes = np.array([len(corners) for corners in parts])
         self._size, self._row = np.searchsorted(_CORNERS, sizes), np.zeros(count, dtype=np.int64)
         self._corners: dict[int, Array] = {}  # (members, V, 3) m, of the parts of each size
@@ -312,7 +315,7 @@ class Overlaps:
         half, middle = x + y + z, translation[owner] + apply(turn, self._middle[part])
         low, high, start = middle - half, middle + half, np.cumsum(self._count[kind]) - self._count[kind]
         whole_low, whole_high = np.minimum.reduceat(low, start), np.maximum.reduceat(high, start)
-        near = _meet(whole_low, whole_high, whole_low, whole_high, first, second)
+        near = boxes_meet(whole_low, whole_high, whole_low, whole_high, first, second)
         order = np.lexsort((*translation.T, kind, scene))
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
@@ -323,7 +326,7 @@ class Overlaps:
         sides = []
         for body in (first, second):  # parts in the box that is common to both bodies
             pair, one = ranges(start[body], self._count[kind[body]])
-            inside = _meet(low, high, common_low, common_high, one, pair)
+            inside = boxes_meet(low, high, common_low, common_high, one, pair)
             sides.append((one[inside], np.bincount(pair[inside], minlength=len(first))))
         (ones, count), (others, other_count) = sides
         products = count * other_count
@@ -335,7 +338,7 @@ class Overlaps:
             pair, number = ranges(np.zeros_like(products[rows]), products[rows])
             row, column = np.divmod(number, other_count[rows][pair])
             one, other = ones[begin[rows][pair] + row], others[other_begin[rows][pair] + column]
-            met = _meet(low, high, low, high, one, other)
+            met = boxes_meet(low, high, low, high, one, other)
             found.append((one[met], other[met]))
         both = np.stack([np.concatenate(column) for column in zip(*found, strict=True)], axis=1)
         body, part = owner[both], part[both]  # (Q, 2)
@@ -399,14 +402,6 @@ class Overlaps:
             except (QhullError, ValueError):  # no volume
                 width[row] = 0.0
         return np.maximum(width, 0.0)  # type: ignore[no-any-return]
-
-
-def _meet(low: Array, high: Array, other_low: Array, other_high: Array, one: Index, other: Index) -> Mask:
-    """(P,) whether the boxes ``one`` (P,) of some and ``other`` (P,) of others meet."""
-    meets = (low[one, 0] <= other_high[other, 0]) & (other_low[other, 0] <= high[one, 0])
-    for axis in (1, 2):
-        meets &= (low[one, axis] <= other_high[other, axis]) & (other_low[other, axis] <= high[one, axis])
-    return meets
 
 
 def _blocks(counts: Index) -> list[slice]:
