@@ -14,16 +14,13 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from scene_envs.arrays import Array, Index, Mask, ranges
-from scene_envs.physics.engines import DAMPING, Course, Moved, fallen, gravity
+from scene_envs.physics.engines import DAMPING, LOOK, STILL_ANGLE, STILL_WAY, Course, Engine, Moved, gravity
 from scene_envs.physics.parts import (
     FRICTION,
-    LibraryGeometry,
-    angle_between,
     apply,
     matrices,
     padded,
     quaternions,
-    times,
 )
 from scene_envs.physics.placement import Objects, boxes_meet
 
@@ -33,10 +30,6 @@ SOLREF, SOLIMP = (0.004, 1.6), (0.98, 0.99, 0.001, 0.5, 2.0)
 """Softness of all contacts, also in exported MJCF files. Objects at rest sink by micrometres, instead of 0.1 mm with
 MuJoCo's defaults. Contacts are damped more than critically, so that overlaps within the limits close in 20 ms, as in
 Bullet: with critical damping they close in 4 ms, and the objects hop."""
-_LOOK = 12
-"""Number of steps between checks for rest."""
-_STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
-"""Objects are at rest when their present speed would take them less far than this (m, rad) in the whole duration."""
 _FAR = 1e5
 """Height (m) of the first body that is not used, and distance between such bodies."""
 _SIZES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 2048, 4096)
@@ -202,9 +195,9 @@ class _Stage:
         model, data = self.model, self.data
         model.opt.gravity[:] = gravity(course.tilt)
         steps, velocity = max(1, round(duration / TIMESTEP)), data.qvel.reshape(-1, 6)[:count]
-        limits = np.repeat((_STILL_WAY / duration, _STILL_ANGLE / duration), 3)
-        for done in range(0, steps, _LOOK):
-            ahead = min(_LOOK, steps - done)
+        limits = np.repeat((STILL_WAY / duration, STILL_ANGLE / duration), 3)
+        for done in range(0, steps, LOOK):
+            ahead = min(LOOK, steps - done)
             mujoco.mj_step(model, data, ahead)
             course.budget.spent += ahead * count
             if course.budget.is_spent or self.is_full or (np.abs(velocity) < limits).all():
@@ -426,16 +419,12 @@ def _aside(kind: Index, position: Array, scene: Index) -> Array:
     return _SAME * np.modf((1.0 + kind + 0.37 * rank[place])[:, None] * steps + np.abs(1e3 * position))[0]  # type: ignore[no-any-return]
 
 
-class MujocoEngine:
-    """MuJoCo C for one asset library; the motion of a cluster depends on that cluster alone, bit for bit.
-
-    Models have places for some number of bodies; objects are sorted and put into the smallest in which they fit, with
-    their shapes, masses, inertias and the trees of their bounding boxes. Threads take turns.
+class MujocoEngine(Engine):
+    """MuJoCo C. Models have places for some number of bodies; objects are sorted and put into the smallest in which
+    they fit, with their shapes, masses, inertias and the trees of their bounding boxes.
     """
 
-    def __init__(self, library: LibraryGeometry) -> None:
-        self._library = library
-        self._lock = threading.Lock()
+    step = TIMESTEP
 
     @cached_property
     def _models(self) -> _Models:
@@ -453,9 +442,7 @@ class MujocoEngine:
         order = np.lexsort((x, y, z, fine, cluster.category, cluster.fixed))  # does not depend on slots
         count = int((~cluster.fixed).sum())
         some, category = cluster[order], cluster.category[order[:count]]
-        center = self._library.center_of_mass
-        position = some.translation + apply(some.rotation, center[some.category])
-        start = quaternions(times(some.rotation, self._library.axes[some.category]))
+        position, start = self._frames(some)
         kind = 2 * some.category + fine[order]
         for room in _ROOMS:
             budget = replace(course.budget)
@@ -468,14 +455,7 @@ class MujocoEngine:
             if not stage.is_full:
                 break
         course.budget.spent = budget.spent
-        rotation, translation, angle = cluster.rotation.copy(), cluster.translation.copy(), np.zeros(len(order))
-        rows, after = order[:count], end[:, [4, 5, 6, 3]]
-        rotation[rows] = times(matrices(after), self._library.axes[category].swapaxes(1, 2))
-        translation[rows] = np.nan if lost else end[:, :3] - apply(rotation[rows], center[category])
-        angle[rows] = angle_between(start[:count], after)
-        return Moved(rotation, translation, angle)
-
-    def fall(self, duration: float) -> tuple[float, float]:
-        """See :class:`~scene_envs.physics.engines.Engine`."""
-        steps = max(1, round(duration / TIMESTEP))
-        return fallen(steps, TIMESTEP), steps
+        after = start.copy()
+        position[:count], after[:count] = np.nan if lost else end[:, :3], end[:, [4, 5, 6, 3]]
+        back = np.argsort(order)
+        return self._moved(cluster.category, position[back], start[back], after[back])
