@@ -139,10 +139,8 @@ class _Stage:
         self._idle[:, 2] = _FAR * (1 + np.arange(sizes[0]))
         self._idle[:, 3] = 1.0
 
-    def place(self, kind: Index, fixed: Mask, position: Array, quaternion: Array) -> Index:
-        """Put bodies of a ``kind`` (n,) into the model, at ``position`` (n, 3) m and ``quaternion`` (n, 4), w first.
-        Returns the row of each of the model's bodies, those of free ones in the given order.
-        """
+    def place(self, kind: Index, fixed: Mask, position: Array, quaternion: Array) -> None:
+        """Put bodies of a ``kind`` (n,) into the model, at ``position`` (n, 3) m and ``quaternion`` (n, 4), w first."""
         model, models = self.model, self._models
         number = 1 + np.where(fixed, self._free + np.cumsum(fixed), np.cumsum(~fixed)) - 1
         counts, sizes = models.count[kind], models.tree[kind]
@@ -165,9 +163,6 @@ class _Stage:
         state[:free, :3], state[:free, 3:] = position[~fixed], quaternion[~fixed]
         mujoco.mj_resetData(model, self.data)
         self.data.qpos[:] = state.ravel()
-        rows = np.zeros(model.nbody, dtype=np.int64)
-        rows[number] = np.arange(len(kind))
-        return rows
 
     def weigh(self, mass: Array, moments: Array) -> None:
         """Set ``mass`` (m,) kg and principal ``moments`` (m, 3) kg m^2 of the free bodies."""
