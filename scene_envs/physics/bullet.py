@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,18 +14,19 @@ from scipy.spatial import ConvexHull
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.errors import PhysicsError
-from scene_envs.physics.engines import CONVERGED, DAMPING, ITERATIONS, Course, Moved, fallen, gravity
-from scene_envs.physics.parts import (
-    FRICTION,
-    LevelGeometry,
-    LibraryGeometry,
-    angle_between,
-    apply,
-    inset_hull,
-    matrices,
-    quaternions,
-    times,
+from scene_envs.physics.engines import (
+    CONVERGED,
+    DAMPING,
+    ITERATIONS,
+    LOOK,
+    STILL_ANGLE,
+    STILL_WAY,
+    Course,
+    Engine,
+    Moved,
+    gravity,
 )
+from scene_envs.physics.parts import FRICTION, LevelGeometry, LibraryGeometry, inset_hull
 from scene_envs.physics.placement import Objects
 from scene_envs.progress import quiet_pybullet
 
@@ -50,8 +49,6 @@ _SPARE_FACTOR = 3
 ``_SPARE_BODIES``: in every step Bullet compares the boxes of all bodies, including parked ones."""
 _ZERO = (0.0, 0.0, 0.0)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-_LOOK = 12
-"""Number of steps between checks for clusters at rest."""
 _USUAL_STEP, _FINEST_STEP = 1.0 / 480.0, 1.0 / 960.0
 """Lengths of a step (s): the usual one, and that for stacks in doubt, in which a tower of ten boxes sinks by about half
 a millimetre."""
@@ -64,8 +61,6 @@ _DOUBT = 6e-4, 3e-3
 _LONG, _CREEP = 1.0, 1e-2
 """In simulations longer than ``_LONG`` (s), motion below ``_CREEP`` (m) may be creep of the solver. It is simulated
 again with ``CONVERGED`` iterations."""
-_STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
-"""An object is at rest when its present speed would take it less far than this (m, rad) in the whole duration."""
 
 
 class BodyPool:
@@ -217,27 +212,12 @@ def _wavefront(hulls: list[Array]) -> str:
     return "\n".join(lines) + "\n"
 
 
-@dataclass(frozen=True)
-class _Settings:
-    """Settings of the integration of motion."""
-
-    time_step: float  # length of a step, s
-    iterations: int  # iterations of the sequential-impulse solver per step
-
-
-_FINEST = _Settings(_FINEST_STEP, ITERATIONS)
-
-
-class BulletEngine:
-    """PyBullet for one asset library; the motion of a cluster depends on that cluster alone, bit for bit.
-
-    Bodies are sorted, placed and parked in an order that does not depend on the slots, and never sleep. Threads take
-    turns. A call that is interrupted leaves no bodies behind. Raises as :class:`BodyPool`.
+class BulletEngine(Engine):
+    """PyBullet. Bodies are sorted, placed and parked in an order that does not depend on the slots, and never sleep. A
+    call that is interrupted leaves no bodies behind. Raises as :class:`BodyPool`.
     """
 
-    def __init__(self, library: LibraryGeometry) -> None:
-        self._library = library
-        self._lock = threading.Lock()
+    step = _USUAL_STEP
 
     @cached_property
     def _pool(self) -> BodyPool:
@@ -250,41 +230,38 @@ class BulletEngine:
         """
         free = ~cluster.fixed
         tallest = int(height[free].max(initial=0))
-        settings = _FINEST if tallest >= _HIGH else _Settings(_USUAL_STEP, ITERATIONS)
+        step = _FINEST_STEP if tallest >= _HIGH else _USUAL_STEP
         if course.settling is not None:
-            return self._run(cluster, fine, duration, course, replace(settings, iterations=course.settling))
-        moved = self._run(cluster, fine, duration, course, settings)
+            return self._run(cluster, fine, duration, course, step, course.settling)
+        moved = self._run(cluster, fine, duration, course, step, ITERATIONS)
         way = np.linalg.norm(moved.translation - cluster.translation, axis=1)
         doubtful = free & (height >= _TALL) & (way > _DOUBT[0]) & (way < _DOUBT[1])
-        if doubtful.any() and settings != _FINEST and not course.budget.is_spent:
-            moved = self._run(cluster, fine, duration, course, _FINEST)
+        if doubtful.any() and step != _FINEST_STEP and not course.budget.is_spent:
+            moved = self._run(cluster, fine, duration, course, _FINEST_STEP, ITERATIONS)
             way = np.linalg.norm(moved.translation - cluster.translation, axis=1)
         creeping = free & (way > _DOUBT[0]) & (way < _CREEP)
         if duration > _LONG and creeping.any() and not course.budget.is_spent:
-            moved = self._run(cluster, fine, duration, course, _Settings(_USUAL_STEP, CONVERGED))
+            moved = self._run(cluster, fine, duration, course, _USUAL_STEP, CONVERGED)
         return moved
 
-    def fall(self, duration: float) -> tuple[float, float]:
-        """See :class:`~scene_envs.physics.engines.Engine`."""
-        steps = max(1, round(duration / _USUAL_STEP))
-        return fallen(steps, _USUAL_STEP), steps
-
-    def _run(self, cluster: Objects, fine: Mask, duration: float, course: Course, settings: _Settings) -> Moved:
+    def _run(
+        self, cluster: Objects, fine: Mask, duration: float, course: Course, step: float, iterations: int
+    ) -> Moved:
+        """One simulation in steps of length ``step`` (s), each of some iterations of the sequential-impulse solver."""
         with self._lock:
             try:
-                return self._simulate(cluster, fine, duration, course, settings)
+                return self._simulate(cluster, fine, duration, course, step, iterations)
             except BaseException:  # an interrupt too: bodies that are not parked would meet those of later clusters
                 self._pool.clear()
                 raise
 
-    def _simulate(self, cluster: Objects, fine: Mask, duration: float, course: Course, settings: _Settings) -> Moved:
+    def _simulate(
+        self, cluster: Objects, fine: Mask, duration: float, course: Course, step: float, iterations: int
+    ) -> Moved:
         bullet, client = self._pool.bullet, self._pool.client
         category, fixed, free = cluster.category, cluster.fixed, np.flatnonzero(~cluster.fixed)
-        axes = self._library.axes[category]
-        center = self._library.center_of_mass[category]
-        quaternion = quaternions(times(cluster.rotation, axes))
-        position = SCALE * (cluster.translation + apply(cluster.rotation, center))
-
+        position, quaternion = self._frames(cluster)
+        position *= SCALE
         bodies, order = self._bodies(cluster, fine)
         for row in order:
             place = int(bodies[row]), int(category[row]), quaternion[row].tolist()
@@ -292,21 +269,19 @@ class BulletEngine:
         # After waking: Bullet sets the gravity of active bodies only.
         bullet.setGravity(*(SCALE * gravity(course.tilt)).tolist(), physicsClientId=client)
         # Bullet refreshes a body's world inertia only when it integrates. Some steps out of contact do that.
-        steps = max(1, round(duration / settings.time_step))
+        steps = max(1, round(duration / step))
         for _ in range(2 + steps % 2):
             bullet.stepSimulation(physicsClientId=client)
         for row in order:
             self._pool.place(int(bodies[row]), position[row].tolist(), quaternion[row].tolist())
-        bullet.setPhysicsEngineParameter(
-            fixedTimeStep=settings.time_step, numSolverIterations=settings.iterations, physicsClientId=client
-        )
+        bullet.setPhysicsEngineParameter(fixedTimeStep=step, numSolverIterations=iterations, physicsClientId=client)
         done = 0
         while done < steps:
-            ahead = min(_LOOK, steps - done)
+            ahead = min(LOOK, steps - done)
             for _ in range(ahead):
                 bullet.stepSimulation(physicsClientId=client)
             done += ahead
-            course.budget.spent += ahead * len(free) * settings.iterations / ITERATIONS
+            course.budget.spent += ahead * len(free) * iterations / ITERATIONS
             if done < steps and (course.budget.is_spent or self._is_still(bodies[free], duration)):
                 for _ in range((steps - done) % 2):  # the number of all steps is always even
                     bullet.stepSimulation(physicsClientId=client)
@@ -318,10 +293,7 @@ class BulletEngine:
             )
         for row in order:
             self._pool.park(int(bodies[row]), int(category[row]))
-        rotation = times(matrices(end_quaternion), axes.swapaxes(-1, -2))
-        moved = Moved(
-            rotation, end_position / SCALE - apply(rotation, center), angle_between(quaternion, end_quaternion)
-        )
+        moved = self._moved(category, end_position / SCALE, quaternion, end_quaternion)
         if not moved.is_finite:
             self._pool.clear()
         return moved
@@ -345,7 +317,7 @@ class BulletEngine:
 
     def _is_still(self, bodies: Index, duration: float) -> bool:
         """Whether all of these bodies are slower than the limits of rest."""
-        speed, turn = _STILL_WAY * SCALE / duration, _STILL_ANGLE / duration
+        speed, turn = STILL_WAY * SCALE / duration, STILL_ANGLE / duration
         for body in bodies.tolist():
             linear, angular = self._pool.bullet.getBaseVelocity(body, physicsClientId=self._pool.client)
             if not all(abs(v) < speed for v in linear) or not all(abs(v) < turn for v in angular):

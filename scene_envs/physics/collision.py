@@ -15,6 +15,7 @@ from scene_envs.physics.placement import (
     ObjectPairs,
     Objects,
     PlacedObjects,
+    boxes_meet,
     object_boxes,
     part_pairs,
     place,
@@ -146,10 +147,12 @@ def corner_tests(library: LibraryGeometry, objects: Objects, first: Index, secon
 
 def boxes_near(low: Array, high: Array, a: Index, b: Index, margin: float, fixed: Mask | None = None) -> Mask:
     """(P,) whether boxes are at most ``margin`` m apart, and pairs of something ``fixed`` at most 6 cm in height."""
-    height = margin if fixed is None else np.where(fixed, NEAR_FIXED, margin)
-    near = (low[a, 0] <= high[b, 0] + margin) & (low[b, 0] <= high[a, 0] + margin)
-    near &= (low[a, 1] <= high[b, 1] + margin) & (low[b, 1] <= high[a, 1] + margin)
-    near &= (low[a, 2] <= high[b, 2] + height) & (low[b, 2] <= high[a, 2] + height)
+    wide = high + margin
+    near = boxes_meet(low, wide, low, wide, a, b)
+    if fixed is not None:
+        some = np.flatnonzero(fixed & ~near)
+        tall = high + np.array([margin, margin, NEAR_FIXED])
+        near[some] = boxes_meet(low, tall, low, tall, a[some], b[some])
     return near
 
 

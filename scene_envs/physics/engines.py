@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import threading
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cache
-from typing import Protocol
 
 import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.errors import InvalidInputError, MissingDependencyError
-from scene_envs.physics.parts import GRAVITY
+from scene_envs.physics.parts import GRAVITY, LibraryGeometry, angle_between, apply, matrices, quaternions, times
 from scene_envs.physics.placement import Budget, Objects
 
 _LOGGER = logging.getLogger(__name__)
@@ -26,6 +27,10 @@ ITERATIONS, CONVERGED = 35, 150
 creep nor give way."""
 DAMPING = 0.3
 """Fraction of velocity that objects lose per second while they settle."""
+LOOK = 12
+"""Number of steps between checks for rest."""
+STILL_WAY, STILL_ANGLE = 1e-4, 1e-3
+"""Objects are at rest when their present speed would take them less far than this (m, rad) in the whole duration."""
 NAMES = ("auto", "bullet", "mujoco", "warp")
 """Names that a user can give."""
 _MODULES = {"bullet": "pybullet", "mujoco": "mujoco", "warp": "mujoco_warp"}
@@ -59,9 +64,19 @@ class Course:
     settling: int | None = None  # iterations per step of Bullet's solver in damped motion; None: undamped
 
 
-class Engine(Protocol):
-    """What computes motion of the objects of one asset library. Results depend on the arguments alone."""
+class Engine(ABC):
+    """What computes motion of the objects of one asset library. Results depend on the arguments alone, bit for bit:
+    neither on slots nor on what was simulated before. Threads take turns.
+    """
 
+    step: float
+    """Length of a step, s."""
+
+    def __init__(self, library: LibraryGeometry) -> None:
+        self._library = library
+        self._lock = threading.Lock()
+
+    @abstractmethod
     def simulate(self, cluster: Objects, fine: Mask, height: Index, duration: float, course: Course) -> Moved:
         """Where the objects (n,) of one scene are after ``duration`` seconds under gravity.
 
@@ -71,21 +86,30 @@ class Engine(Protocol):
         """
 
     def fall(self, duration: float) -> tuple[float, float]:
-        """Way (m) of an object in free fall in ``duration`` seconds by the engine's steps, and its work in units."""
+        """Way (m) of an object in free fall in ``duration`` seconds by the engine's steps, in which the speed grows
+        first, and its work in units.
+        """
+        steps = max(1, round(duration / self.step))
+        return 0.5 * GRAVITY * self.step**2 * steps * (steps + 1), steps
+
+    def _frames(self, objects: Objects) -> tuple[Array, Array]:
+        """Centres of mass (n, 3) m of objects, and quaternions (n, 4), w last, of their principal axes."""
+        category, rotation = objects.category, objects.rotation
+        position = objects.translation + apply(rotation, self._library.center_of_mass[category])
+        return position, quaternions(times(rotation, self._library.axes[category]))
+
+    def _moved(self, category: Index, position: Array, start: Array, end: Array) -> Moved:
+        """Objects whose frames, as :meth:`_frames` gives them, turned from ``start`` (n, 4) to ``end`` (n, 4) and are
+        at ``position`` (n, 3) m.
+        """
+        rotation = times(matrices(end), self._library.axes[category].swapaxes(1, 2))
+        translation = position - apply(rotation, self._library.center_of_mass[category])
+        return Moved(rotation, translation, angle_between(start, end))
 
 
 def gravity(tilt: tuple[float, float]) -> Array:
     """(3,) m/s^2, tilted by the (x, y) angles (rad)."""
     return GRAVITY * np.array([*np.sin(tilt), -np.cos(np.hypot(*tilt))])  # type: ignore[no-any-return]
-
-
-def fallen(steps: int, length: float) -> float:
-    """Way (m) of free fall in ``steps`` of a ``length`` (s), in which the speed grows first.
-
-    >>> round(fallen(50, 0.002), 6)
-    0.050031
-    """
-    return 0.5 * GRAVITY * length**2 * steps * (steps + 1)
 
 
 def is_installed(name: str) -> bool:

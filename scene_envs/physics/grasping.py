@@ -14,7 +14,7 @@ from torch import Tensor
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.assets.base import AssetLibrary, ConvexPart
-from scene_envs.assets.fcl import Broadphase, convex, shapes_of
+from scene_envs.assets.fcl import Boxed, convex, shapes_of
 from scene_envs.assets.shapes import box
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch, require_rigid_poses
@@ -23,6 +23,8 @@ TOUCHING = 1e-4
 """The gripper's boxes are smaller by this (m) on each side, so that it may touch objects."""
 TURNS = tuple(np.arange(4) * np.pi / 4)
 """Angles (rad) of the closing direction about the approach, counted from an axis of the object."""
+_LOOSE = 1e-5
+"""Boxes of the gripper's parts are larger by this (m) on each side, more than what FCL takes for contact."""
 PLACES = (0.5, 0.0, 1.0)
 """Grasp positions as fractions of the object's extent in the closing direction: its middle, then its two edges."""
 
@@ -100,20 +102,29 @@ class _Hand:
         self.gripper = gripper
         self.shapes = shapes_of(library.assets)
         self.corners = [np.concatenate([part.vertices for part in asset.fine]) for asset in library]
-        self.body = [convex(part) for part in gripper.body()]
-        self.grasp = convex(gripper.grasp())
+        self.starts = [np.cumsum([0, *(len(part.vertices) for part in asset.fine[:-1])]) for asset in library]
+        parts = gripper.grasp(), *gripper.body()
+        self.parts = [convex(part) for part in parts]  # the space between the fingers, and the three of the body
+        sides = np.array([(part.vertices.min(axis=0), part.vertices.max(axis=0)) for part in parts])
+        self.middle, self.half = sides.mean(axis=1), 0.5 * (sides[:, 1] - sides[:, 0])  # (4, 3) m
 
     def reach(self, category: Index, rotation: Array, translation: Array, free: Index, back: Array) -> Mask:
         """(A, n) whether the gripper reaches the n objects of one scene from the directions ``back`` (A, 3); it is
         tried at those of the rows ``free``. The caller holds the lock of the shapes.
         """
         placed = self.shapes.place(category.tolist(), rotation, translation)
-        scene, own = Broadphase(chain(*placed)), [Broadphase(placed[row]) for row in free]
-        corners = [self.corners[category[row]] @ rotation[row].T + translation[row] for row in free]
+        corners = [self.corners[c] @ rotation[row].T + translation[row] for row, c in enumerate(category)]
+        low, high = (
+            [side.reduceat(points, self.starts[c]) for points, c in zip(corners, category, strict=True)]
+            for side in (np.minimum, np.maximum)
+        )
+        none = np.empty((0, 3))
+        scene = Boxed(list(chain(*placed)), np.concatenate([none, *low]), np.concatenate([none, *high]))
+        own = [Boxed(placed[row], low[row], high[row]) for row in free]
         reached = np.zeros((len(back), len(category)), dtype=bool)
         for side, direction in enumerate(back / np.linalg.norm(back, axis=1, keepdims=True)):
             frames = _frames(rotation[free], direction)
-            trials = zip(frames, self._tips(corners, frames), own, strict=True)
+            trials = zip(frames, self._tips([corners[row] for row in free], frames), own, strict=True)
             reached[side, free] = [self._reaches(*trial, scene) for trial in trials]
         return reached
 
@@ -130,18 +141,21 @@ class _Hand:
         middle = np.broadcast_to(0.5 * (low[..., 1] + high[..., 1]), deep.shape)
         return np.einsum("ntij,nptj->npti", frames, np.stack([across, middle, deep], axis=-1))
 
-    def _reaches(self, frames: Array, tips: Array, own: Broadphase, scene: Broadphase) -> bool:
+    def _reaches(self, frames: Array, tips: Array, own: Boxed, scene: Boxed) -> bool:
         """Whether at one of the places ``tips`` (P, T, 3) m, turned as ``frames`` (T, 3, 3), one of the object's
         ``own`` parts is between the fingers, and the gripper meets nothing of the scene.
         """
-        for places in tips:
-            for rotation, place in zip(frames, places, strict=True):
+        middle = tips[:, :, None] + self.middle @ frames.swapaxes(1, 2)  # (P, T, 4, 3)
+        half = self.half @ np.abs(frames).swapaxes(1, 2) + _LOOSE
+        for places, lows, highs in zip(tips, middle - half, middle + half, strict=True):
+            for rotation, place, low, high in zip(frames, places, lows, highs, strict=True):
                 pose = Transform(rotation, place)
-                for part in (self.grasp, *self.body):
+                for part in self.parts:
                     part.setTransform(pose)
-                if any(map(scene.meets_last, self.body)):
+                if any(map(scene.meets_last, self.parts[1:])):
                     continue
-                if own.meets(self.grasp) and not any(map(scene.meets, self.body)):
+                grasp, *body = zip(self.parts, low, high, strict=True)
+                if own.meets(*grasp) and not any(scene.meets(*part) for part in body):
                     return True
         return False
 

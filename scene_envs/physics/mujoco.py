@@ -14,28 +14,22 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from scene_envs.arrays import Array, Index, Mask, ranges
-from scene_envs.physics.engines import DAMPING, Course, Moved, fallen, gravity
+from scene_envs.physics.engines import DAMPING, LOOK, STILL_ANGLE, STILL_WAY, Course, Engine, Moved, gravity
 from scene_envs.physics.parts import (
     FRICTION,
-    LibraryGeometry,
-    angle_between,
     apply,
     matrices,
     padded,
     quaternions,
-    times,
 )
-from scene_envs.physics.placement import Objects
+from scene_envs.physics.placement import Objects, boxes_meet
 
 TIMESTEP = 0.002
 """Length of a step, s, also in exported MJCF files."""
-SOLREF, SOLIMP = (0.004, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)
-"""Stiffness of all contacts, also in exported MJCF files, as large as the step allows: objects at rest sink by
-micrometres, instead of 0.1 mm with MuJoCo's defaults."""
-_LOOK = 12
-"""Number of steps between checks for rest."""
-_STILL_WAY, _STILL_ANGLE = 1e-4, 1e-3
-"""Objects are at rest when their present speed would take them less far than this (m, rad) in the whole duration."""
+SOLREF, SOLIMP = (0.004, 1.6), (0.98, 0.99, 0.001, 0.5, 2.0)
+"""Softness of all contacts, also in exported MJCF files. Objects at rest sink by micrometres, instead of 0.1 mm with
+MuJoCo's defaults. Contacts are damped more than critically, so that overlaps within the limits close in 20 ms, as in
+Bullet: with critical damping they close in 4 ms, and the objects hop."""
 _FAR = 1e5
 """Height (m) of the first body that is not used, and distance between such bodies."""
 _SIZES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 2048, 4096)
@@ -145,10 +139,8 @@ class _Stage:
         self._idle[:, 2] = _FAR * (1 + np.arange(sizes[0]))
         self._idle[:, 3] = 1.0
 
-    def place(self, kind: Index, fixed: Mask, position: Array, quaternion: Array) -> Index:
-        """Put bodies of a ``kind`` (n,) into the model, at ``position`` (n, 3) m and ``quaternion`` (n, 4), w first.
-        Returns the row of each of the model's bodies, those of free ones in the given order.
-        """
+    def place(self, kind: Index, fixed: Mask, position: Array, quaternion: Array) -> None:
+        """Put bodies of a ``kind`` (n,) into the model, at ``position`` (n, 3) m and ``quaternion`` (n, 4), w first."""
         model, models = self.model, self._models
         number = 1 + np.where(fixed, self._free + np.cumsum(fixed), np.cumsum(~fixed)) - 1
         counts, sizes = models.count[kind], models.tree[kind]
@@ -171,9 +163,6 @@ class _Stage:
         state[:free, :3], state[:free, 3:] = position[~fixed], quaternion[~fixed]
         mujoco.mj_resetData(model, self.data)
         self.data.qpos[:] = state.ravel()
-        rows = np.zeros(model.nbody, dtype=np.int64)
-        rows[number] = np.arange(len(kind))
-        return rows
 
     def weigh(self, mass: Array, moments: Array) -> None:
         """Set ``mass`` (m,) kg and principal ``moments`` (m, 3) kg m^2 of the free bodies."""
@@ -201,9 +190,9 @@ class _Stage:
         model, data = self.model, self.data
         model.opt.gravity[:] = gravity(course.tilt)
         steps, velocity = max(1, round(duration / TIMESTEP)), data.qvel.reshape(-1, 6)[:count]
-        limits = np.repeat((_STILL_WAY / duration, _STILL_ANGLE / duration), 3)
-        for done in range(0, steps, _LOOK):
-            ahead = min(_LOOK, steps - done)
+        limits = np.repeat((STILL_WAY / duration, STILL_ANGLE / duration), 3)
+        for done in range(0, steps, LOOK):
+            ahead = min(LOOK, steps - done)
             mujoco.mj_step(model, data, ahead)
             course.budget.spent += ahead * count
             if course.budget.is_spent or self.is_full or (np.abs(velocity) < limits).all():
@@ -282,9 +271,11 @@ class Overlaps:
         count = len(parts)
         self._position, self._radius = model.geom_pos[:count].copy(), model.geom_rbound[:count].copy()
         self._rotation = matrices(np.roll(model.geom_quat[:count], -1, axis=1))
-        box = model.geom_aabb[:count]
-        self._middle = self._position + apply(self._rotation, box[:, :3])  # (P, 3) m, of the box of each part
-        self._axes = self._rotation * (box[:, None, 3:] + 2.0 * _SAME)  # (P, 3, 3) m, its half axes, columns
+        inner = [corners @ turn for corners, turn in zip(parts, self._rotation, strict=True)]
+        low, high = (np.stack([side(corners, axis=0) for corners in inner]) for side in (np.min, np.max))
+        self._middle = apply(self._rotation, 0.5 * (low + high))  # (P, 3) m, of the box of each part
+        # (P, 3, 3) m, its half axes, columns; no two parts overlap deeper than their boxes do
+        self._axes = 0.5 * self._rotation * (high - low - _ROUNDING)[:, None]
         sizes = np.array([len(corners) for corners in parts])
         self._size, self._row = np.searchsorted(_CORNERS, sizes), np.zeros(count, dtype=np.int64)
         self._corners: dict[int, Array] = {}  # (members, V, 3) m, of the parts of each size
@@ -312,7 +303,7 @@ class Overlaps:
         half, middle = x + y + z, translation[owner] + apply(turn, self._middle[part])
         low, high, start = middle - half, middle + half, np.cumsum(self._count[kind]) - self._count[kind]
         whole_low, whole_high = np.minimum.reduceat(low, start), np.maximum.reduceat(high, start)
-        near = _meet(whole_low, whole_high, whole_low, whole_high, first, second)
+        near = boxes_meet(whole_low, whole_high, whole_low, whole_high, first, second)
         order = np.lexsort((*translation.T, kind, scene))
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
@@ -323,7 +314,7 @@ class Overlaps:
         sides = []
         for body in (first, second):  # parts in the box that is common to both bodies
             pair, one = ranges(start[body], self._count[kind[body]])
-            inside = _meet(low, high, common_low, common_high, one, pair)
+            inside = boxes_meet(low, high, common_low, common_high, one, pair)
             sides.append((one[inside], np.bincount(pair[inside], minlength=len(first))))
         (ones, count), (others, other_count) = sides
         products = count * other_count
@@ -335,7 +326,7 @@ class Overlaps:
             pair, number = ranges(np.zeros_like(products[rows]), products[rows])
             row, column = np.divmod(number, other_count[rows][pair])
             one, other = ones[begin[rows][pair] + row], others[other_begin[rows][pair] + column]
-            met = _meet(low, high, low, high, one, other)
+            met = boxes_meet(low, high, low, high, one, other)
             found.append((one[met], other[met]))
         both = np.stack([np.concatenate(column) for column in zip(*found, strict=True)], axis=1)
         body, part = owner[both], part[both]  # (Q, 2)
@@ -401,14 +392,6 @@ class Overlaps:
         return np.maximum(width, 0.0)  # type: ignore[no-any-return]
 
 
-def _meet(low: Array, high: Array, other_low: Array, other_high: Array, one: Index, other: Index) -> Mask:
-    """(P,) whether the boxes ``one`` (P,) of some and ``other`` (P,) of others meet."""
-    meets = (low[one, 0] <= other_high[other, 0]) & (other_low[other, 0] <= high[one, 0])
-    for axis in (1, 2):
-        meets &= (low[one, axis] <= other_high[other, axis]) & (other_low[other, axis] <= high[one, axis])
-    return meets
-
-
 def _blocks(counts: Index) -> list[slice]:
     """Slices of rows whose ``counts`` (P,) are together about ``_BLOCK``."""
     number = np.cumsum(counts) // _BLOCK
@@ -431,16 +414,12 @@ def _aside(kind: Index, position: Array, scene: Index) -> Array:
     return _SAME * np.modf((1.0 + kind + 0.37 * rank[place])[:, None] * steps + np.abs(1e3 * position))[0]  # type: ignore[no-any-return]
 
 
-class MujocoEngine:
-    """MuJoCo C for one asset library; the motion of a cluster depends on that cluster alone, bit for bit.
-
-    Models have places for some number of bodies; objects are sorted and put into the smallest in which they fit, with
-    their shapes, masses, inertias and the trees of their bounding boxes. Threads take turns.
+class MujocoEngine(Engine):
+    """MuJoCo C. Models have places for some number of bodies; objects are sorted and put into the smallest in which
+    they fit, with their shapes, masses, inertias and the trees of their bounding boxes.
     """
 
-    def __init__(self, library: LibraryGeometry) -> None:
-        self._library = library
-        self._lock = threading.Lock()
+    step = TIMESTEP
 
     @cached_property
     def _models(self) -> _Models:
@@ -458,9 +437,7 @@ class MujocoEngine:
         order = np.lexsort((x, y, z, fine, cluster.category, cluster.fixed))  # does not depend on slots
         count = int((~cluster.fixed).sum())
         some, category = cluster[order], cluster.category[order[:count]]
-        center = self._library.center_of_mass
-        position = some.translation + apply(some.rotation, center[some.category])
-        start = quaternions(times(some.rotation, self._library.axes[some.category]))
+        position, start = self._frames(some)
         kind = 2 * some.category + fine[order]
         for room in _ROOMS:
             budget = replace(course.budget)
@@ -473,14 +450,7 @@ class MujocoEngine:
             if not stage.is_full:
                 break
         course.budget.spent = budget.spent
-        rotation, translation, angle = cluster.rotation.copy(), cluster.translation.copy(), np.zeros(len(order))
-        rows, after = order[:count], end[:, [4, 5, 6, 3]]
-        rotation[rows] = times(matrices(after), self._library.axes[category].swapaxes(1, 2))
-        translation[rows] = np.nan if lost else end[:, :3] - apply(rotation[rows], center[category])
-        angle[rows] = angle_between(start[:count], after)
-        return Moved(rotation, translation, angle)
-
-    def fall(self, duration: float) -> tuple[float, float]:
-        """See :class:`~scene_envs.physics.engines.Engine`."""
-        steps = max(1, round(duration / TIMESTEP))
-        return fallen(steps, TIMESTEP), steps
+        after = start.copy()
+        position[:count], after[:count] = np.nan if lost else end[:, :3], end[:, [4, 5, 6, 3]]
+        back = np.argsort(order)
+        return self._moved(cluster.category, position[back], start[back], after[back])

@@ -172,6 +172,14 @@ def object_boxes(placed: PlacedObjects) -> tuple[Array, Array]:
     return np.minimum.reduceat(placed.low, placed.start), np.maximum.reduceat(placed.high, placed.start)
 
 
+def boxes_meet(low: Array, high: Array, other_low: Array, other_high: Array, one: Index, other: Index) -> Mask:
+    """(P,) whether the boxes ``one`` (P,) of some (n, 3) and ``other`` (P,) of others (m, 3) meet."""
+    meets = np.ones(len(one), dtype=bool)
+    for bottom, top, other_bottom, other_top in zip(low.T, high.T, other_low.T, other_high.T, strict=True):
+        meets &= (bottom.take(one) <= other_top.take(other)) & (other_bottom.take(other) <= top.take(one))
+    return meets
+
+
 def part_pairs(placed: PlacedObjects, first: Index, second: Index) -> tuple[Index, Index, Index]:
     """All pairs of parts of the object pairs (``first``, ``second``), both (P,): index (Q,) of the object pair, and the
     two parts (Q,), (Q,) as rows of ``placed.parts``.
