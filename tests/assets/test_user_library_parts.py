@@ -81,6 +81,17 @@ def test_the_angle_iron_is_one_closed_body() -> None:
     assert angle_iron().volume == pytest.approx(0.06 * (0.1 * 0.02 + 0.08 * 0.02))
 
 
+def test_boxes_that_share_a_corner_are_two_parts() -> None:
+    boxes = [trimesh.creation.box((0.1, 0.1, 0.1)).apply_translation([side] * 3) for side in (-0.05, 0.05)]
+    surface = trimesh.util.concatenate(boxes)
+    surface.merge_vertices()
+    assert len(surface.vertices) == 15
+    parts, solid, notes, warnings = decomposition.convex_parts(surface, "auto", 0.002, 0.05, "it")
+    assert sorted(round(ConvexHull(part.vertices).volume, 9) for part in parts) == [0.001, 0.001]
+    assert solid.mass == pytest.approx(0.002)
+    assert not notes + warnings
+
+
 @pytest.mark.slow
 def test_a_concave_mesh_keeps_its_hollow(tmp_path: Path) -> None:
     pytest.importorskip("coacd")

@@ -14,7 +14,8 @@ from xml.etree import ElementTree
 import pytest
 
 from scene_envs.assets.importing.build import AssetEntry, build_asset
-from scene_envs.errors import SceneEnvsError
+from scene_envs.assets.importing.robot_files import read_usd
+from scene_envs.errors import InvalidInputError, SceneEnvsError
 from tests.helpers.model_files import POINTS, block, dae, gltf, triangles
 
 CUBE = "box 0.2 0.1 0.04"
@@ -241,6 +242,29 @@ def test_each_property_of_the_physics_of_usd(tmp_path: Path) -> None:
             changed[short] = path
     assert len(changed) >= 12
     assert sorted(silent(tmp_path / "it.usda", changed)) == [], sorted(changed)
+
+
+@pytest.mark.parametrize(
+    ("apis", "enabled", "static"),
+    [("PhysicsRigidBodyAPI", True, None), ("PhysicsRigidBodyAPI", False, True), ("", True, True)],
+)
+def test_only_an_enabled_body_of_the_api_is_free(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], apis: str, enabled: bool, static: bool | None
+) -> None:
+    """A property that is left of a removed API makes no body, and the library of USD has nothing to warn of."""
+    pytest.importorskip("pxr")
+    shape = 'def Cube "c" ( prepend apiSchemas = ["PhysicsCollisionAPI"] ) { }'
+    head = f'prepend apiSchemas = ["{apis}"]' if apis else ""
+    body = f'def Xform "it" ( {head} )\n{{ bool physics:rigidBodyEnabled = {int(enabled)}\n {shape}\n}}\n'
+    path = tmp_path / "it.usda"
+    path.write_text(f'#usda 1.0\n( metersPerUnit = 1\n upAxis = "Z" )\n{body}')
+    assert read_usd(path).static is static
+    assert capfd.readouterr() == ("", "")
+    still = body.replace("Enabled = 1", "Enabled = 0").replace('"it"', '"table"')
+    path.write_text(f'#usda 1.0\n( metersPerUnit = 1\n upAxis = "Z" )\n{body}{still}')
+    if apis:
+        with pytest.raises(InvalidInputError, match=r"2 bodies \(/it, /table\)"):
+            read_usd(path)
 
 
 def test_each_shape_of_usd_is_read_or_named_or_refused(tmp_path: Path) -> None:

@@ -471,12 +471,13 @@ def read_usd(path: Path) -> Model:
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         raise InvalidInputError(f"{path} does not state `metersPerUnit`; set it, 1 for metres or 0.01 for centimetres")
     reading = _Stage(path, stage)
-    prims = [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()) if prim.IsActive()]
-    bodies = [prim for prim in prims if UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get()]
+    prims = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.IsActive()]
+    found = [prim for prim in prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
+    bodies = [prim for prim in found if UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get()]
     joints = [UsdPhysics.Joint(prim) for prim in prims if prim.IsA(UsdPhysics.Joint)]
-    if len(bodies) > 1 and not joints:
-        names = ", ".join(str(prim.GetPath()) for prim in bodies)
-        raise InvalidInputError(f"{path} holds {len(bodies)} bodies ({names}); an asset is one, so put each in a file")
+    if len(found) > 1 and not joints:
+        names = ", ".join(str(prim.GetPath()) for prim in found)
+        raise InvalidInputError(f"{path} holds {len(found)} bodies ({names}); an asset is one, so put each in a file")
     if many := [prim.GetPath() for prim in prims if prim.IsA(UsdGeom.PointInstancer)]:
         raise InvalidInputError(f"{path}: {many[0]} is a point instancer, which is not read; make its instances prims")
     for prim in prims:
@@ -489,7 +490,8 @@ def read_usd(path: Path) -> Model:
     notes = list(dict.fromkeys(reading.notes))
     if movable := [j.GetPrim().GetName() for j in joints if not j.GetPrim().IsA(UsdPhysics.FixedJoint)]:
         notes.append(f"movable joints frozen where they are: {', '.join(movable)}")
-    held = any(not end.GetTargets() for joint in joints for end in (joint.GetBody0Rel(), joint.GetBody1Rel()))
+    ends = [end for joint in joints for end in (joint.GetBody0Rel(), joint.GetBody1Rel())]
+    held = not all(end.GetTargets() for end in ends) or 0 < len(bodies) < len(found)  # a disabled body is static
     why = "it has colliders and no rigid body" if reading.collisions and not bodies else ""
     if why := "a joint holds it at the world" if held else why:
         notes.append(f"{why}: it is welded (`welded: false` makes it free)")

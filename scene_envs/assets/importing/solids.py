@@ -189,7 +189,9 @@ def convex_parts(
 
 def _pieces(surface: Any) -> list[Any]:
     """The connected pieces of a bare mesh, whose holes of three or four corners are filled."""
-    is_one = surface.is_watertight and surface.body_count == 1
+    from trimesh.graph import connected_component_labels as labels
+
+    is_one = surface.is_watertight and not labels(surface.face_adjacency, len(surface.faces)).any()  # not by corners
     return [surface] if is_one else list(surface.split(only_watertight=False))
 
 
