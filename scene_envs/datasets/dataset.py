@@ -77,9 +77,9 @@ class SceneDataset:
     metadata: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        sets = [(prompts,) if isinstance(prompts, str) else tuple(prompts) for prompts in self.prompt_sets]
-        if len(sets) != len(self) or not all(sets):
-            raise InvalidInputError(f"{len(self)} scenes need as many prompts or tuples of prompts, got {len(sets)}")
+        sets = [(prompts,) if isinstance(prompts, str) else tuple(prompts or ()) for prompts in self.prompt_sets]
+        if len(sets) != len(self) or not all(texts and all(isinstance(t, str) for t in texts) for texts in sets):
+            raise InvalidInputError(f"{len(self)} scenes need as many prompts or tuples of them, got {str(sets)[:99]}")
         object.__setattr__(self, "prompt_sets", sets)
         object.__setattr__(self, "scene_type", get_scene_type(self.scene_type))
 

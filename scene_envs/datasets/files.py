@@ -275,7 +275,7 @@ def _to_array(column: pa.Array, features: int, start: int) -> NDArray[np.floatin
     else:  # one flat list per scene
         widths = np.full(1, features if (sizes % features == 0).all() else int(sizes[0]))
         sizes = sizes // features
-    if (widths != features).any() or (sizes != sizes[0]).any():
+    if (widths != features).any() or (sizes != max(1, sizes[0])).any():
         slots, found = sorted(set(sizes.tolist())), sorted(set(widths.tolist()))
         raise ValueError(f"slots per scene {slots[:5]}, features per slot {found[:5]}, expected {features} features")
     if inner.null_count:

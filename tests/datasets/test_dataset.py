@@ -81,8 +81,8 @@ def test_a_dataset_with_one_prompt_per_scene_has_the_published_columns(dataset: 
     assert SceneDataset.load(tmp_path).prompt_sets == one.prompt_sets
 
 
-@pytest.mark.parametrize("sets", [["A scene."] * 39, [()] * 40])
-def test_each_scene_needs_a_prompt(dataset: SceneDataset, sets: list[str]) -> None:
+@pytest.mark.parametrize("sets", [["A scene."] * 39, [()] * 40, [None] * 40, [("A scene.", 1)] * 40])
+def test_each_scene_needs_a_prompt(dataset: SceneDataset, sets: list[object]) -> None:
     with pytest.raises(InvalidInputError, match="40 scenes need as many prompts"):
         SceneDataset(dataset.tensor, sets, dataset.normalizer, TYPE)
 
@@ -581,6 +581,7 @@ def test_ragged_and_wrong_columns_are_named(tmp_path: Path) -> None:
     _metadata(tmp_path)
     for column, words in (
         ([[[0.0] * 16] * 5, [[0.0] * 16] * 4], r"slots per scene \[4, 5\]"),
+        ([[], []], r"slots per scene \[0\]"),
         ([[[0.0] * 20] * 5] * 2, r"features per slot \[20\], expected 16"),
         ([[0.0] * 81] * 2, "expected 16 features"),
         (["a", "b"], "expected lists of floats"),
