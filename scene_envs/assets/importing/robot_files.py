@@ -490,10 +490,9 @@ def read_usd(path: Path) -> Model:
     notes = list(dict.fromkeys(reading.notes))
     if movable := [j.GetPrim().GetName() for j in joints if not j.GetPrim().IsA(UsdPhysics.FixedJoint)]:
         notes.append(f"movable joints frozen where they are: {', '.join(movable)}")
-    ends = [end for joint in joints for end in (joint.GetBody0Rel(), joint.GetBody1Rel())]
-    held = not all(end.GetTargets() for end in ends) or 0 < len(bodies) < len(found)  # a disabled body is static
+    held = any(not end.GetTargets() for joint in joints for end in (joint.GetBody0Rel(), joint.GetBody1Rel()))
     why = "it has colliders and no rigid body" if reading.collisions and not bodies else ""
-    if why := "a joint holds it at the world" if held else why:
+    if why := "a joint holds it at the world" if held or 0 < len(bodies) < len(found) else why:  # disabled is static
         notes.append(f"{why}: it is welded (`welded: false` makes it free)")
     shapes = tuple(reading.visuals), tuple(shape for _, shape in reading.collisions)
     return Model(*shapes, tuple(reading.inertials), bool(why) or None, tuple(notes))

@@ -189,9 +189,9 @@ def convex_parts(
 
 def _pieces(surface: Any) -> list[Any]:
     """The connected pieces of a bare mesh, whose holes of three or four corners are filled."""
-    from trimesh.graph import connected_component_labels as labels
+    from trimesh.graph import connected_component_labels as labels  # by edges: bodies may share a corner
 
-    is_one = surface.is_watertight and not labels(surface.face_adjacency, len(surface.faces)).any()  # not by corners
+    is_one = surface.is_watertight and not labels(surface.face_adjacency, len(surface.faces)).any()
     return [surface] if is_one else list(surface.split(only_watertight=False))
 
 
