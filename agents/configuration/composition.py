@@ -214,7 +214,7 @@ def check_same_keys(
     folder: Path, before: Mapping[str, Any], now: Mapping[str, Any], may_differ: Collection[str]
 ) -> None:
     """Refuse to go on in a folder that was written with other values of keys, but for those that ``may_differ``; keys
-    of only one of the two do not count.
+    of only one of the two do not count, unless they stand in a group of both.
     """
     heads = [key for key in now if key in before and key not in may_differ and before[key] != now[key]]
     was, is_now = (dotted({key: values[key] for key in heads}) for values in (before, now))
