@@ -95,7 +95,7 @@ class GARDO(ForwardProcess):
         uncertain = (excess > 0) & ((-excess).argsort().argsort() < self.settings.share * len(excess))
         kinds, entries = scenes.tensor[..., POSE_FEATURES:-1], F.pad(x0[..., TRANSLATION], (0, 1), value=1.0)
         features = F.normalize(torch.einsum("bnk,bnf->bkf", kinds, entries).flatten(1), dim=1)
-        near = (1 - features @ features.T).fill_diagonal_(torch.inf)
+        near = (1 - features @ features.T).clamp(min=0.0).fill_diagonal_(torch.inf)  # rounding goes below 0
         same = torch.ones_like(near).bool() if prompts is None else prompts[:, None] == prompts
         nearest = near.masked_fill(~same, torch.inf).amin(dim=1)
         far = (nearest * same.sum(dim=1) / torch.where(same, nearest, 0.0).sum(dim=1)).nan_to_num(1.0)[:, None]

@@ -14,6 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from importlib.util import find_spec
+from numbers import Number
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -80,8 +81,7 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
         UnknownNameError: a key that ``kind`` does not have; the nearest one is offered.
         InvalidInputError: a value is not of the type of its key.
     """
-    from omegaconf import OmegaConf
-    from omegaconf.errors import ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
+    from omegaconf import OmegaConf, errors
 
     OmegaConf.register_new_resolver("text", lambda code: bytes.fromhex(code[1:]).decode(), replace=True)
     schema, values = OmegaConf.structured(kind), dict(tree)
@@ -96,19 +96,19 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
             values[field.name] = _shortest(value)
     try:
         made: Any = OmegaConf.to_object(OmegaConf.merge(schema, values))
-    except InterpolationResolutionError as error:
+    except errors.InterpolationResolutionError as error:
+        place = f"{command}: {path}{error.full_key}".removeprefix(": ")
         raise InvalidInputError(
-            f"{command}: {error.full_key}: {reason_of(error)}; ${{KEY}} is the value of another key, ${{oc.env:NAME}} "
-            "that of the environment"
+            f"{place}: {reason_of(error)}; ${{KEY}} is the value of another key, ${{oc.env:NAME}} of the environment"
         ) from error
-    except ConfigKeyError as error:
+    except (errors.ConfigKeyError, errors.KeyValidationError) as error:
         known = [path + key for key in dotted(OmegaConf.to_container(schema))]  # type: ignore[arg-type]
         raise unknown_name(f"{command} key".strip(), f"{path}{error.full_key}", known) from error
-    except OmegaConfBaseException as error:
+    except errors.OmegaConfBaseException as error:
         _require_groups(schema, values, path)
         place = (error.full_key or "").partition("[")[0]
         parent, _, name = place.rpartition(".")
-        hint = hint_of(OmegaConf.get_type(schema, parent or None), name)
+        hint = hint_of(OmegaConf.get_type(OmegaConf.select(schema, parent) if parent else schema), name)
         value = functools.reduce(lambda inner, key: inner[key], place.split("."), values)
         raise _refusal(hint, value, path + place) from error
     return made
@@ -136,8 +136,15 @@ def verbatim(value: Any) -> Any:
         return {key: verbatim(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [verbatim(item) for item in value]
+    if isinstance(value, Number) and hasattr(value, "item"):
+        return value.item()  # of NumPy
     is_plain = not isinstance(value, str) or ("${" not in value and value != "???")
     return value if is_plain else f"${{text:x{value.encode().hex()}}}"
+
+
+def _as_given(message: str) -> str:
+    """A message with the texts of :func:`verbatim` as they were given."""
+    return re.sub(r"\$\{text:x(\w+)\}", lambda found: bytes.fromhex(found[1]).decode(), message)
 
 
 def _shortest(value: Any) -> Any:
@@ -207,7 +214,7 @@ def check_same_keys(
     folder: Path, before: Mapping[str, Any], now: Mapping[str, Any], may_differ: Collection[str]
 ) -> None:
     """Refuse to go on in a folder that was written with other values of keys, but for those that ``may_differ``; keys
-    of only one of the two do not count.
+    of only one of the two do not count, unless they stand in a group of both.
     """
     heads = [key for key in now if key in before and key not in may_differ and before[key] != now[key]]
     was, is_now = (dotted({key: values[key] for key in heads}) for values in (before, now))
@@ -285,7 +292,7 @@ def as_command_line_text(value: Any) -> str:
         return ",".join(map(as_command_line_text, value))
     if dataclasses.is_dataclass(value):
         return f"{{{', '.join(f'{key}: {as_command_line_text(item)}' for key, item in vars(value).items())}}}"
-    return str(value)
+    return _as_given(str(value))
 
 
 # Groups, their options, and recipes
@@ -472,7 +479,7 @@ def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any
 def reason_of(error: BaseException) -> str:
     while error.__cause__ is not None:
         error = error.__cause__
-    return str(error).splitlines()[0].strip().rstrip(".")
+    return _as_given(str(error).splitlines()[0].strip().rstrip("."))
 
 
 # Keys that several commands share

@@ -188,8 +188,9 @@ class CategoricalProcess:
         if isinstance(t, int) and x_t.ndim > 1:  # once for each state
             key = t, previous, x_t.device
             if key not in self._tables:
-                every = torch.arange(self.categories + 1, device=x_t.device)
-                self._tables[key] = self._stride(every, t, previous)
+                with torch.inference_mode(False):  # training may read them, too
+                    every = torch.arange(self.categories + 1, device=x_t.device)
+                    self._tables[key] = self._stride(every, t, previous)
             likelihood, back, *rates = self._tables[key]
             return F.embedding(x_t, likelihood), F.embedding(x_t, back), *rates
         keep_s, mask_s = self._rates_at(previous, x_t)

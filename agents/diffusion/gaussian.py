@@ -259,7 +259,7 @@ class GaussianProcess:
             return compute()
         key = name, t, like.device, like.dtype
         if key not in self._kept:
-            with torch.no_grad():
+            with torch.inference_mode(False), torch.no_grad():
                 self._kept[key] = compute()
         return self._kept[key]
 

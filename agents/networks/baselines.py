@@ -69,11 +69,6 @@ class MixedBaselineConfig(BaselineConfig):
     categories: int
 
 
-def attention(hidden: int, heads: int) -> nn.MultiheadAttention:
-    """Attention of torch for tokens (B, N, H)."""
-    return nn.MultiheadAttention(hidden, heads, batch_first=True)
-
-
 def attended(layer: nn.MultiheadAttention, tokens: Tensor, source: Tensor, padding: Tensor | None = None) -> Tensor:
     """Tokens (B, N, H) after attention to ``source`` (B, M, H); ``padding`` (B, M) is True where nothing attends."""
     result: Tensor = layer(tokens, source, source, key_padding_mask=padding, need_weights=False)[0]
@@ -223,11 +218,11 @@ class _Block(nn.Module):
 
     def __init__(self, config: _MiDiffusionSize) -> None:
         super().__init__()
-        hidden = config.hidden
+        hidden, heads = config.hidden, config.heads
         self.norm, self.feed_norm = _AdaptiveNorm(hidden), _AdaptiveNorm(hidden)
-        self.attention = attention(hidden, config.heads)
+        self.attention = nn.MultiheadAttention(hidden, heads, batch_first=True)
         self.text_norm = _AdaptiveNorm(hidden) if config.text_width else None
-        self.text_attention = attention(hidden, config.heads) if config.text_width else None
+        self.text_attention = nn.MultiheadAttention(hidden, heads, batch_first=True) if config.text_width else None
         self.feed = mlp(hidden, 4 * hidden, hidden)
 
     def forward(self, tokens: Tensor, condition: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
@@ -310,9 +305,9 @@ class _Attend(nn.Module):
         super().__init__()
         hidden, heads = config.hidden, config.heads
         self.norm = nn.GroupNorm(heads, hidden)
-        self.attention = attention(hidden, heads)
+        self.attention = nn.MultiheadAttention(hidden, heads, batch_first=True)
         self.text_norm = nn.GroupNorm(heads, hidden) if config.text_width else None
-        self.text_attention = attention(hidden, heads) if config.text_width else None
+        self.text_attention = nn.MultiheadAttention(hidden, heads, batch_first=True) if config.text_width else None
 
     def forward(self, x: Tensor, text: Tensor | None, padding: Tensor | None) -> Tensor:
         """Channels (B, H, N) to the same."""

@@ -115,19 +115,14 @@ class Replays:
         layout = tuple((value.shape, value.dtype) if isinstance(value, Tensor) else value for value in given)
         weights = tuple(weight.data_ptr() for weight in network.parameters())
         key = tuple(named), layout, inputs[0].device, getattr(network, "body_precision", ""), weights
-        if (
-            len(self._known) >= 4 * _MAX_GRAPHS and key not in self._known
-        ):  # weights that were replaced, and their graphs
+        if len(self._known) >= 4 * _MAX_GRAPHS and key not in self._known:  # of weights that were replaced
             self._known.clear()
         known = self._known.setdefault(key, 0)
         if isinstance(known, int):
             self._known[key] = known + 1
-            if (
-                known + 1 < _CAPTURED_AT
-                or sum(not isinstance(entry, int) for entry in self._known.values()) >= _MAX_GRAPHS
-            ):
-                return _plain(network, *inputs, **named)
-            known = self._captured(network, inputs, named)
+            captured = sum(not isinstance(entry, int) for entry in self._known.values())
+            is_due = known + 1 >= _CAPTURED_AT and captured < _MAX_GRAPHS
+            known = self._captured(network, inputs, named) if is_due else None
             if known is None:
                 return _plain(network, *inputs, **named)
             self._known[key] = known

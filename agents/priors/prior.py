@@ -339,10 +339,11 @@ class ScenePrior(nn.Module, ABC):
         """What is known of the entries of scenes ``x`` (B, N, D); computed once for each number of slots."""
         key = x.shape[1], x.device, x.dtype
         if key not in self._frames:
-            known, count = self.known(x.shape[1]).to(x.device), len(self.scene_type.fixed)
-            values = torch.cat([self._fixed[:count].to(x), x.new_zeros(x.shape[1] - count, known.shape[1])])
-            free = torch.arange(x.shape[1], device=x.device) >= count
-            self._frames[key] = Frame(known, values, free, (~known).to(x))
+            with torch.inference_mode(False):  # training may read it, too
+                known, count = self.known(x.shape[1]).to(x.device), len(self.scene_type.fixed)
+                values = torch.cat([self._fixed[:count].to(x), x.new_zeros(x.shape[1] - count, known.shape[1])])
+                free = torch.arange(x.shape[1], device=x.device) >= count
+                self._frames[key] = Frame(known, values, free, (~known).to(x))
         return self._frames[key]
 
     def stride(self, t: int, previous: int, eta: float, like: Tensor) -> tuple[float, float, Tensor]:
@@ -353,9 +354,10 @@ class ScenePrior(nn.Module, ABC):
         key = t, previous, eta, like.device
         known = self._strides.get(key)
         if known is None or known[0] is not self.residual:
-            residual = None if self.residual is None else self.residual.at(t)
-            x0_weight, xt_weight, std = self.process.posterior_weights(t, previous, residual, eta)
-            known = self._strides[key] = (self.residual, (x0_weight, xt_weight, std.to(like.device)))
+            with torch.inference_mode(False):  # training may read it, too
+                residual = None if self.residual is None else self.residual.at(t)
+                x0_weight, xt_weight, std = self.process.posterior_weights(t, previous, residual, eta)
+                known = self._strides[key] = (self.residual, (x0_weight, xt_weight, std.to(like.device)))
         return known[1]
 
     def encode(self, batch: SceneBatch) -> Tensor:

@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -65,6 +66,7 @@ def test_configs_declare_a_dozen_fields_at_most() -> None:
     assert len(found) > 60
     whole = {  # classes whose keys stand in groups, or in a JSON file
         "agents/networks/flux.py: MixedFluxConfig": 15,
+        "agents/post_training/settings.py: PostTrainConfig": 16,
         "scene_envs/assets/importing/build.py: AssetEntry": 13,
     }
     assert {name: len(own) for name, own in found.items() if len(own) > 12} == whole
@@ -163,6 +165,11 @@ def test_every_option_of_a_group_composes() -> None:
     [
         (lambda: PretrainConfig(network={"hiden": 3}), "did you mean 'network.hidden'"),
         (lambda: PretrainConfig(network={"hidden": "wide"}), "network.hidden=wide is not a whole number"),
+        (lambda: PretrainConfig(network={"modules": {"contacts": "far"}}), "network.modules.contacts=far is not true"),
+        (lambda: PretrainConfig(optimizer={"lr": "${seed}"}), r"optimizer.lr: .*'\$\{seed\}' of type 'str'"),
+        (lambda: PostTrainConfig(regularisation={"scenes": "???"}), r"regularisation.scenes=\?\?\? is not a text"),
+        (lambda: PostTrainConfig(guard={"limits": {"count": "few"}}), "guard.limits.count=few is not a number or null"),
+        (lambda: PostTrainConfig(guard={None: 3}), "unknown key"),
         (lambda: PretrainConfig(optimizer="sgd"), "sgd"),
         (lambda: PretrainConfig(text=True), "text is a group of keys; give one of text.encoder"),
         (lambda: PostTrainConfig(rewrad="x"), "did you mean 'reward'"),
@@ -173,6 +180,11 @@ def test_every_option_of_a_group_composes() -> None:
 def test_wrong_values_in_python_are_named(make: Any, message: str) -> None:
     with pytest.raises((InvalidInputError, UnknownNameError), match=message):
         make()
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    optimizer = PostTrainConfig(optimizer={"lr": np.float64(1e-4), "chunk": np.int64(4)}).optimizer
+    assert (optimizer.lr, type(optimizer.chunk), optimizer.chunk) == (1e-4, int, 4)
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from agents.networks import denoisers
 from agents.networks.denoisers import Replays, check_precision, parts_of, products_in
 from agents.networks.flux import gelu
 from agents.networks.geometry import nearest_rotations
+from agents.post_training import DenoisingPolicy
 from agents.priors.testing import tiny_prior
 from scene_envs.arrays import constant_on
 from scene_envs.errors import InvalidInputError, UnknownNameError
@@ -236,3 +237,18 @@ def test_constants_that_move_to_a_device_in_inference_mode_serve_where_gradients
     with torch.inference_mode():
         moved = constant_on(torch.ones(2), torch.device("meta"))
     assert not moved.is_inference()
+
+
+@pytest.mark.parametrize("process", ["continuous", "mixed"])
+def test_a_prior_that_was_sampled_in_inference_mode_is_trained_afterwards(process: str) -> None:
+    prior = tiny_prior("dimsum_table", process=process)
+    with torch.inference_mode():
+        prior.sample(2, num_steps=3)
+    policy = DenoisingPolicy(prior, 3)
+    x = prior.initial(2, prior.scene_type.slots)
+    for step in range(2):
+        action, _ = policy.draw(x, step)
+        policy.log_prob(x, step, action).sum().backward()
+    gradients = [weight.grad for weight in prior.parameters() if weight.grad is not None]
+    assert gradients
+    assert all(bool(torch.isfinite(gradient).all()) for gradient in gradients)
