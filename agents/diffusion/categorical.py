@@ -1,6 +1,6 @@
-"""Discrete diffusion on categories (D3PM; Austin et al. 2021): absorbing, uniform and mask-and-replace kernels.
+"""Discrete diffusion on categories (D3PM; Austin et al. 2021): absorbing and mask-and-replace kernels.
 
-All three kernels are of one family that is closed under composition, so that strides of any length have posteriors in
+All kernels are of one family that is closed under composition, so that strides of any length have posteriors in
 closed form and few-step chains have exact log-probabilities. From s to t a category
 
     is kept with probability k, is replaced by the mask token with probability m,
@@ -9,7 +9,6 @@ closed form and few-step chains have exact log-probabilities. From s to t a cate
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -53,14 +52,6 @@ def _absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
     return 1.0 - mask, mask
 
 
-def _uniform(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """Resampled along a squared cosine (Hoogeboom et al. 2021), never masked."""
-    t = torch.arange(num_timesteps + 1, dtype=torch.float64) / num_timesteps
-    keep = torch.cos(t * math.pi / 2) ** 2
-    keep[0], keep[-1] = 1.0, 0.0
-    return keep, torch.zeros_like(keep)
-
-
 def _mask_and_replace(num_timesteps: int) -> tuple[Tensor, Tensor]:
     """The paper's: keep falls from 0.99999 to 9e-6 and mask rises from 9e-6 to 0.99999, linearly over 1..T."""
     keep = torch.linspace(0.99999, 0.000009, num_timesteps, dtype=torch.float64)
@@ -90,7 +81,6 @@ CATEGORICAL_KERNELS: dict[str, Callable[[int], tuple[Tensor, Tensor]]] = {
     "absorbing": _absorbing,
     "early_absorbing": _early_absorbing,
     "squared_absorbing": _squared_absorbing,
-    "uniform": _uniform,
     "mask_and_replace": _mask_and_replace,
 }
 

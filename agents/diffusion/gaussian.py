@@ -277,11 +277,6 @@ class GaussianProcess:
         alpha, sigma = self.rates(t, x0)
         return alpha * x0 + sigma * noise
 
-    def renoise(self, x_s: Tensor, s: int, t: int, noise: Tensor) -> Tensor:
-        """A sample of q(x_t | x_s), s < t: adds noise to go back from s to t."""
-        ratio = self.schedule.alpha_bar[t] / self.schedule.alpha_bar[s]
-        return float(ratio.sqrt()) * x_s + float((1.0 - ratio).sqrt()) * noise
-
     def network_input(self, x_t: Tensor, t: Tensor | int) -> Tensor:
         """x_t scaled to unit variance per feature for ``edm`` (Karras et al. 2022, c_in); x_t itself otherwise."""
         if self.prediction != "edm":

@@ -83,7 +83,7 @@ class FluxSettings(Checked):
 NETWORKS = ("flux", "midiffusion", "diffuscene")
 """Networks of this package."""
 PROCESSES = ("mixed", "continuous")
-KERNELS = ("mask_and_replace", "absorbing", "early_absorbing", "squared_absorbing", "uniform")
+KERNELS = ("mask_and_replace", "absorbing", "early_absorbing", "squared_absorbing")
 TEXT_ENCODERS = {
     "none": {"encoder": "none"},
     "vocabulary": {"encoder": "vocabulary"},
@@ -154,7 +154,7 @@ class ProcessSettings(Checked):
             continuous process), of each ``feature``, or of the whole ``scene``.
         rotation: numbers that a continuous prior diffuses for a rotation: ``matrix``, ``quaternion`` or ``axis_angle``.
         kernel: noise kernel of the categories of a mixed prior: ``mask_and_replace``, ``absorbing``,
-            ``early_absorbing``, ``squared_absorbing`` or ``uniform``.
+            ``early_absorbing`` or ``squared_absorbing``.
         empty_slots: treatment of slots that are known to be empty. ``attended`` keeps them in the network, as in the
             paper; ``dropped`` leaves them out, which saves most of the work and needs a mixed prior with an absorbing
             kernel.

@@ -20,7 +20,7 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type, members_of
 
 TABLE, KINDS = 0, 8
-KERNELS = ("squared_absorbing", "mask_and_replace", "uniform")
+KERNELS = ("squared_absorbing", "mask_and_replace")
 
 
 class WantsTables(torch.nn.Module):
