@@ -42,9 +42,8 @@ REWARDS = {
     "prompt_match": make_reward("prompt_match"),
     "clip": make_reward("clip", reward="feasible_objects", high=3.0),
     "product": make_reward("product", rewards=["object_count", "feasible_objects"]),
-    **{name: make_reward(name) for name in ("feasible_share", "clutter", "stability", "reachability", "diversity")},
+    **{name: make_reward(name) for name in ("feasible_share", "clutter", "stability", "reachability")},
     "penetration (reward)": make_reward("penetration"),
-    "realism": make_reward("realism"),
     "weighted_sum": make_reward("weighted_sum", rewards=["object_count", "feasible_objects"], weights=[1.0, 1.0]),
 }
 PHYSICS: dict[str, Function] = {
@@ -114,8 +113,6 @@ def scored(batch: SceneBatch, reward: Reward, context: RewardContext) -> RewardO
         RewardError: the reward failed.
     """
     forget_verdicts()
-    if reward.name == "diversity":  # compares scenes of a batch
-        batch = batch[[0, 0]]
     return evaluate_reward(reward, batch, context, strict=True)
 
 

@@ -81,8 +81,6 @@ PICTURES = {
     "prompt_match": Picture(NAMED, "dimsum_table"),
     "reachability": Picture("reachability", "dimsum_table", 0.0, "not reached", without_credit),
     "clearance": Picture("clearance", "dimsum_table", 0.01, "crowded", lambda b, o: o.object_flags["crowded"]),
-    "diversity": Picture("diversity", "breakfast_table_low_clutter"),
-    "realism": Picture("realism", "dimsum_table", 0.01),
     "discriminator": Picture(trained_discriminator, "dimsum_table", 0.01, "probability below 0.5", without_credit),
 }
 COUNT = 12

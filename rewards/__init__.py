@@ -17,14 +17,12 @@ from rewards.clearance import Clearance
 from rewards.clutter import Clutter
 from rewards.composite import Clip, Product, WeightedSum
 from rewards.counts import CategoryCount, ObjectCount
-from rewards.diversity import Diversity
 from rewards.evaluation import evaluate_reward
 from rewards.feasible import FeasibleObjects, FeasibleShare, Stability
 from rewards.penetration import Penetration
 from rewards.process import IsolatedReward
 from rewards.prompt_match import PromptMatch
 from rewards.reachability import Reachability
-from rewards.realism import Realism
 from rewards.registry import (
     RewardInfo,
     allow_local_rewards,
@@ -43,7 +41,6 @@ __all__ = [
     "Clearance",
     "Clip",
     "Clutter",
-    "Diversity",
     "FeasibleObjects",
     "FeasibleShare",
     "IsolatedReward",
@@ -53,7 +50,6 @@ __all__ = [
     "Product",
     "PromptMatch",
     "Reachability",
-    "Realism",
     "Reward",
     "RewardContext",
     "RewardInfo",

@@ -105,21 +105,6 @@ class EncodedPriorLike(PriorLike, Protocol):
         """Scenes of x (B, N, D)."""
 
 
-@runtime_checkable
-class LikelihoodPriorLike(PriorLike, Protocol):
-    """A prior that says how likely scenes are under it, by its training loss."""
-
-    def encode(self, batch: SceneBatch) -> Tensor:
-        """Normalised x_0 (B, N, D) of scenes that begin with the scene type's fixed objects."""
-
-    def pretraining_loss(
-        self, x0: Tensor, generator: Generator | None = None, reduction: str = "mean", t: Tensor | None = None
-    ) -> Tensor:
-        """(B,) training losses of x_0 (B, N, D) at timesteps ``t`` (B,) with ``reduction="none"``; all noise comes from
-        ``generator``.
-        """
-
-
 class PromptedPriorLike(PriorLike, Protocol):
     """A prior whose ``conditional`` is True: it reads prompts."""
 

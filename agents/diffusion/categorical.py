@@ -1,6 +1,6 @@
-"""Discrete diffusion on categories (D3PM; Austin et al. 2021): absorbing, uniform and mask-and-replace kernels.
+"""Discrete diffusion on categories (D3PM; Austin et al. 2021): absorbing and mask-and-replace kernels.
 
-All three kernels are of one family that is closed under composition, so that strides of any length have posteriors in
+All kernels are of one family that is closed under composition, so that strides of any length have posteriors in
 closed form and few-step chains have exact log-probabilities. From s to t a category
 
     is kept with probability k, is replaced by the mask token with probability m,
@@ -9,7 +9,6 @@ closed form and few-step chains have exact log-probabilities. From s to t a cate
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,9 +31,9 @@ _TINY = 1e-30
 class CategoricalSchedule:
     """Cumulative rates of a kernel at t = 0..T.
 
-    >>> schedule = make_categorical_schedule("absorbing", 10)
-    >>> round(float(schedule.keep[5]), 3), round(float(schedule.mask[5]), 3)
-    (0.5, 0.5)
+    >>> schedule = make_categorical_schedule("early_absorbing", 10)
+    >>> round(float(schedule.keep[6]), 3), round(float(schedule.mask[6]), 3)
+    (0.8, 0.2)
     """
 
     name: str  # one of :data:`CATEGORICAL_KERNELS`
@@ -47,20 +46,6 @@ class CategoricalSchedule:
         return self.keep.shape[0] - 1
 
 
-def _absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """Masks an equal share of original categories per timestep, all of them at T (Austin et al. 2021, app. A.2.2)."""
-    mask = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
-    return 1.0 - mask, mask
-
-
-def _uniform(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """Resampled along a squared cosine (Hoogeboom et al. 2021), never masked."""
-    t = torch.arange(num_timesteps + 1, dtype=torch.float64) / num_timesteps
-    keep = torch.cos(t * math.pi / 2) ** 2
-    keep[0], keep[-1] = 1.0, 0.0
-    return keep, torch.zeros_like(keep)
-
-
 def _mask_and_replace(num_timesteps: int) -> tuple[Tensor, Tensor]:
     """The paper's: keep falls from 0.99999 to 9e-6 and mask rises from 9e-6 to 0.99999, linearly over 1..T."""
     keep = torch.linspace(0.99999, 0.000009, num_timesteps, dtype=torch.float64)
@@ -70,7 +55,9 @@ def _mask_and_replace(num_timesteps: int) -> tuple[Tensor, Tensor]:
 
 
 def _early_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """Absorbing from T/2 on, so that a reverse chain draws all categories in its first half."""
+    """Masks an equal share of original categories per timestep (Austin et al. 2021, app. A.2.2), but from T/2 on: a
+    reverse chain draws all categories in its first half.
+    """
     u = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
     mask = torch.maximum(1e-5 * u, (u - 0.5) / 0.5)
     return 1.0 - mask, mask
@@ -87,10 +74,8 @@ def _squared_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
 
 
 CATEGORICAL_KERNELS: dict[str, Callable[[int], tuple[Tensor, Tensor]]] = {
-    "absorbing": _absorbing,
     "early_absorbing": _early_absorbing,
     "squared_absorbing": _squared_absorbing,
-    "uniform": _uniform,
     "mask_and_replace": _mask_and_replace,
 }
 
@@ -113,8 +98,8 @@ class CategoricalProcess:
         schedule: cumulative rates.
         categories: number K of categories.
 
-    >>> process = CategoricalProcess(make_categorical_schedule("absorbing", 4), 3)
-    >>> process.marginal(torch.tensor([1]), torch.tensor([2]))
+    >>> process = CategoricalProcess(make_categorical_schedule("early_absorbing", 4), 3)
+    >>> process.marginal(torch.tensor([1]), torch.tensor([3]))
     tensor([[0.0000, 0.5000, 0.0000, 0.5000]])
     """
 

@@ -15,6 +15,7 @@ from agents.diffusion.categorical import CategoricalProcess, fitted
 from scene_envs.arrays import constant_on
 from scene_envs.errors import InvalidInputError, unknown_name
 
+SCHEDULES = ("karras", "linear")
 PREDICTIONS = ("edm", "epsilon", "x0", "v")
 """Targets that a network may predict; see :meth:`GaussianProcess.x0_from_output`."""
 TIMESTEP_DISTRIBUTIONS = ("lognormal", "uniform", "both")
@@ -95,10 +96,6 @@ class Preconditioning:
         flat = data.reshape(-1, data.shape[-1]).double()
         return cls(flat.mean(dim=0).float(), flat.std(dim=0).clamp(min=floor).float())
 
-    def pooled(self) -> Preconditioning:
-        """One standard deviation for all features (their root mean square), as Karras et al. use."""
-        return Preconditioning(self.mean, self.std.square().mean().sqrt().expand_as(self.std).clone())
-
     def state(self) -> dict[str, Any]:
         """The moments as JSON."""
         state: dict[str, Any] = {"mean": self.mean.tolist(), "std": self.std.tolist()}
@@ -155,7 +152,7 @@ class NoiseSchedule:
     """Cumulative signal rate of a variance-preserving diffusion, x_t = sqrt(a_t) x_0 + sqrt(1 - a_t) eps.
 
     Attributes:
-        name: ``"karras"``, ``"linear"`` or ``"cosine"``.
+        name: ``"karras"`` or ``"linear"``.
         alpha_bar: (T + 1,) float64, decreasing from 1 at t = 0.
 
     >>> schedule = make_schedule("karras", 1000)
@@ -194,27 +191,12 @@ def linear_alpha_bar(num_timesteps: int, beta_start: float = 1e-4, beta_end: flo
     return torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1.0 - beta, dim=0)])
 
 
-def cosine_alpha_bar(num_timesteps: int, offset: float = 0.008, max_beta: float = 0.999) -> Tensor:
-    """(T + 1,) of the squared-cosine schedule (Nichol and Dhariwal 2021, Eq. 17), betas capped at ``max_beta``."""
-    t = torch.arange(num_timesteps + 1, dtype=torch.float64) / num_timesteps
-    f = torch.cos((t + offset) / (1 + offset) * math.pi / 2) ** 2
-    beta = (1.0 - f[1:] / f[:-1]).clamp(max=max_beta)
-    return torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1.0 - beta, dim=0)])
-
-
-_SCHEDULES: dict[str, Callable[[int], Tensor]] = {
-    "karras": karras_alpha_bar,
-    "linear": linear_alpha_bar,
-    "cosine": cosine_alpha_bar,
-}
-
-
 def make_schedule(
     name: str, num_timesteps: int = 1000, noise_floor: float = 0.002, noise_ceiling: float = 80.0
 ) -> NoiseSchedule:
     """The schedule called ``name`` with ``num_timesteps`` levels; ``"karras"`` goes from floor to ceiling."""
-    if name not in _SCHEDULES:
-        raise unknown_name("noise schedule", name, _SCHEDULES)
+    if name not in SCHEDULES:
+        raise unknown_name("noise schedule", name, SCHEDULES)
     if num_timesteps < 2:
         raise InvalidInputError(f"a noise schedule needs at least 2 timesteps, got {num_timesteps}")
     if name == "karras":
@@ -223,7 +205,7 @@ def make_schedule(
                 f"noise_floor={noise_floor:g} must be positive and below noise_ceiling={noise_ceiling:g}"
             )
         return NoiseSchedule(name, karras_alpha_bar(num_timesteps, noise_floor, noise_ceiling))
-    return NoiseSchedule(name, _SCHEDULES[name](num_timesteps))
+    return NoiseSchedule(name, linear_alpha_bar(num_timesteps))
 
 
 def check_prediction(name: str) -> None:
@@ -276,11 +258,6 @@ class GaussianProcess:
         """A sample of q(x_t | x_0) (Ho et al. 2020, Eq. 4)."""
         alpha, sigma = self.rates(t, x0)
         return alpha * x0 + sigma * noise
-
-    def renoise(self, x_s: Tensor, s: int, t: int, noise: Tensor) -> Tensor:
-        """A sample of q(x_t | x_s), s < t: adds noise to go back from s to t."""
-        ratio = self.schedule.alpha_bar[t] / self.schedule.alpha_bar[s]
-        return float(ratio.sqrt()) * x_s + float((1.0 - ratio).sqrt()) * noise
 
     def network_input(self, x_t: Tensor, t: Tensor | int) -> Tensor:
         """x_t scaled to unit variance per feature for ``edm`` (Karras et al. 2022, c_in); x_t itself otherwise."""

@@ -196,7 +196,7 @@ def _continuous(config: PretrainConfig, raw: Tensor, normalizer: Normalizer) -> 
         **_chain(config),
     )
     torch.manual_seed(config.seed)
-    return ContinuousPrior(prior_config, normalizer, moments.pooled() if config.process.moments == "scene" else moments)
+    return ContinuousPrior(prior_config, normalizer, moments)
 
 
 def _mixed(config: PretrainConfig, raw: Tensor, normalizer: Normalizer, prompts: Sequence[Sequence[str]]) -> MixedPrior:
@@ -304,8 +304,6 @@ def _pose_moments(kind: str, raw: Tensor, normalizer: Normalizer) -> Preconditio
     """Moments of the normalised poses of all objects of raw scenes (M, N, D)."""
     poses = normalizer.normalize(raw)[..., :POSE_FEATURES]
     moments = Preconditioning.fit(poses[raw[..., -1] == 0])
-    if kind == "scene":
-        return moments.pooled()
     if kind == "feature":
         return moments
     categories = raw[..., POSE_FEATURES:].argmax(dim=-1)

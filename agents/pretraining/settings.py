@@ -83,7 +83,7 @@ class FluxSettings(Checked):
 NETWORKS = ("flux", "midiffusion", "diffuscene")
 """Networks of this package."""
 PROCESSES = ("mixed", "continuous")
-KERNELS = ("mask_and_replace", "absorbing", "early_absorbing", "squared_absorbing", "uniform")
+KERNELS = ("mask_and_replace", "early_absorbing", "squared_absorbing")
 TEXT_ENCODERS = {
     "none": {"encoder": "none"},
     "vocabulary": {"encoder": "vocabulary"},
@@ -148,13 +148,13 @@ class ProcessSettings(Checked):
         name: ``mixed`` (categories as discrete states) or ``continuous`` (categories as numbers).
         prediction: target of the network: ``edm`` (preconditioning of Karras et al. 2022), ``epsilon``, ``x0`` or
             ``v``.
-        schedule: noise schedule: ``karras``, ``linear`` or ``cosine``.
+        schedule: noise schedule: ``karras`` or ``linear``.
         noise: noise-to-signal ratios of the karras schedule.
         moments: mean and standard deviation that scale the network's output: of each ``category`` (of each feature in a
-            continuous process), of each ``feature``, or of the whole ``scene``.
+            continuous process), or of each ``feature``.
         rotation: numbers that a continuous prior diffuses for a rotation: ``matrix``, ``quaternion`` or ``axis_angle``.
-        kernel: noise kernel of the categories of a mixed prior: ``mask_and_replace``, ``absorbing``,
-            ``early_absorbing``, ``squared_absorbing`` or ``uniform``.
+        kernel: noise kernel of the categories of a mixed prior: ``mask_and_replace``,
+            ``early_absorbing`` or ``squared_absorbing``.
         empty_slots: treatment of slots that are known to be empty. ``attended`` keeps them in the network, as in the
             paper; ``dropped`` leaves them out, which saves most of the work and needs a mixed prior with an absorbing
             kernel.
@@ -166,9 +166,9 @@ class ProcessSettings(Checked):
 
     name: Annotated[str, OneOf(PROCESSES, "process")] = "mixed"
     prediction: Annotated[str, OneOf(("edm", "epsilon", "x0", "v"))] = "edm"
-    schedule: Annotated[str, OneOf(("karras", "linear", "cosine"), "noise schedule")] = "karras"
+    schedule: Annotated[str, OneOf(("karras", "linear"), "noise schedule")] = "karras"
     noise: NoiseRange = nested(NoiseRange)
-    moments: Annotated[str, OneOf(("category", "feature", "scene"))] = "category"
+    moments: Annotated[str, OneOf(("category", "feature"))] = "category"
     rotation: Annotated[str, OneOf(("matrix", "quaternion", "axis_angle"))] = "matrix"
     kernel: Annotated[str, OneOf(KERNELS, "categorical kernel")] = "early_absorbing"
     empty_slots: Annotated[str, OneOf(("attended", "dropped"), "treatment of empty slots")] = "dropped"

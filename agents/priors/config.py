@@ -39,7 +39,7 @@ class PoseDiffusionConfig:
     """Noise of the poses, and the loss of their denoising.
 
     Attributes:
-        schedule: noise schedule, ``"karras"``, ``"linear"`` or ``"cosine"``.
+        schedule: noise schedule, ``"karras"`` or ``"linear"``.
         prediction: ``"edm"`` (preconditioning of Karras et al. 2022), ``"epsilon"``, ``"x0"`` or ``"v"``.
         num_timesteps: T of the schedule.
         noise_mean: mean of ln(noise-to-signal) over training timesteps.

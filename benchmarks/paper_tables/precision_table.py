@@ -41,11 +41,11 @@ def _categories(kernel: str, empty_slots: str, loss: str) -> dict[str, Any]:
 FACTORS: tuple[Setting, ...] = (
     *_predictions("none", "", "edm", "epsilon", "v", "x0"),
     *_predictions("min_snr", ", min-SNR", "epsilon", "v", "x0"),
-    *_each("schedule", "process.schedule", "karras", "cosine", "linear"),
+    *_each("schedule", "process.schedule", "karras", "linear"),
     *_each("noise floor", "process.noise.floor", 0.01, 0.002, 0.0005),
     *_each("noise ceiling", "process.noise.ceiling", 20.0, 80.0),
     *_each("timesteps", "loss.timesteps", "lognormal", "uniform", "both"),
-    *_each("moments per", "process.moments", "scene", "feature", "category"),
+    *_each("moments per", "process.moments", "feature", "category"),
     *_each("translation weight", "loss.translation_weight", 1.0, 3.0),
     *_each("relations of slots, blurred by the noise of the", "network.modules.relations", "none", "largest", "axis"),
     *_each("Fourier octaves", "network.flux.frequencies", 0, 8),
@@ -57,9 +57,8 @@ FACTORS: tuple[Setting, ...] = (
     *_each("empty slots", "process.empty_slots", "dropped", "attended"),
     ("categories: early absorbing, dropped, cross-entropy", _categories("early_absorbing", "dropped", "cross_entropy")),
     ("categories: absorbed along a square", _categories("squared_absorbing", "dropped", "cross_entropy")),
-    ("categories: absorbing, dropped, cross-entropy", _categories("absorbing", "dropped", "cross_entropy")),
     ("categories: mask and replace, cross-entropy", _categories("mask_and_replace", "attended", "cross_entropy")),
-    ("categories: absorbing, bound", _categories("absorbing", "attended", "bound")),
+    ("categories: early absorbing, bound", _categories("early_absorbing", "attended", "bound")),
 )
 """Settings that the precision table changes, one at a time."""
 

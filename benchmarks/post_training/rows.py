@@ -16,6 +16,7 @@ FORWARD, CHAIN = "nft", "ddpo_sf"
 DISTILLATION = "guidance_distillation"
 PLUG_INS = ("udm_grpo", "crd", "gardo")
 """Algorithms of files in ``examples/``."""
+_EXAMPLES = Path(__file__).parents[2] / "examples"
 LENGTH = 300
 """Iterations of a row."""
 
@@ -142,7 +143,10 @@ def _realism() -> tuple[Row, ...]:
     return tuple(
         Row(f"{prior}-{label}-0", prior, (f"algorithm={FORWARD}", reward, "seed=0"), 100)
         for prior in ("breakfast_table_high_clutter", "restaurant_low_clutter", "restaurant_high_clutter")
-        for label, reward in (("discriminator", "reward=discriminator"), ("realism", "reward=realism"))
+        for label, reward in (
+            ("discriminator", "reward=discriminator"),
+            ("realism", f"reward={_EXAMPLES / 'scene_rewards.py'}:Realism"),
+        )
     )
 
 
@@ -158,7 +162,7 @@ def _frontier() -> tuple[Row, ...]:
 
 def _keys(algorithm: str, reward: str, seed: int) -> tuple[str, ...]:
     if algorithm in PLUG_INS:
-        algorithm = f"{Path(__file__).parents[2] / 'examples' / algorithm}.py:{algorithm}"
+        algorithm = f"{_EXAMPLES / algorithm}.py:{algorithm}"
     return f"algorithm={algorithm}", f"reward={reward}", f"seed={seed}"
 
 

@@ -84,8 +84,8 @@ def test_every_factor_is_asked() -> None:
         (key, value) for key, value in STANDARD.items() if isinstance(value, str | int | float)
     }
     assert {("process.prediction", name) for name in ("epsilon", "v", "x0", "edm")} <= asked
-    assert {("process.schedule", name) for name in ("linear", "cosine", "karras")} <= asked
-    assert {("process.moments", name) for name in ("scene", "feature", "category")} <= asked
+    assert {("process.schedule", name) for name in ("linear", "karras")} <= asked
+    assert {("process.moments", name) for name in ("feature", "category")} <= asked
     assert {("process.noise.floor", value) for value in (0.01, 0.002, 0.0005)} <= asked
     assert {("loss.translation_weight", 1.0), ("loss.translation_weight", 3.0)} <= asked
     assert {("optimizer.rate.final", 1.0), ("optimizer.rate.decay", 1.0)} <= asked
@@ -110,7 +110,7 @@ def test_keys_of_a_row_win_over_those_of_all_rows(tmp_path: Path) -> None:
     settings = TablesConfig(
         size="tiny",
         iterations=7,
-        pretraining={"network": {"depth": 3}, "process.schedule": "cosine"},
+        pretraining={"network": {"depth": 3}, "process.schedule": "karras"},
         output=str(tmp_path),
     )
     config = run_config(Row("one", {"process.schedule": "linear"}), settings)

@@ -380,7 +380,7 @@ def test_the_names_that_are_known_without_torch_are_those_of_the_packages():
 
 def test_words_of_groups_are_those_of_the_parts_they_are_for():
     from agents.diffusion.categorical import CATEGORICAL_KERNELS, UNMASKINGS
-    from agents.diffusion.gaussian import _SCHEDULES, LOSS_WEIGHTINGS, PREDICTIONS, TIMESTEP_DISTRIBUTIONS
+    from agents.diffusion.gaussian import LOSS_WEIGHTINGS, PREDICTIONS, SCHEDULES, TIMESTEP_DISTRIBUTIONS
     from agents.evaluation.measure import MEASURES
     from agents.networks.denoisers import EMPTY_SLOTS
     from agents.networks.flux import TEXT_REACHES
@@ -392,7 +392,7 @@ def test_words_of_groups_are_those_of_the_parts_they_are_for():
     for make, key, known in (
         (ProcessSettings, "name", PROCESSES),
         (ProcessSettings, "prediction", PREDICTIONS),
-        (ProcessSettings, "schedule", _SCHEDULES),
+        (ProcessSettings, "schedule", SCHEDULES),
         (ProcessSettings, "rotation", ROTATION_WIDTHS),
         (ProcessSettings, "kernel", CATEGORICAL_KERNELS),
         (ProcessSettings, "empty_slots", EMPTY_SLOTS),

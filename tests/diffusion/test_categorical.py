@@ -154,13 +154,13 @@ def test_the_loss_is_smallest_at_the_truth_and_gradients_are_finite(name: str) -
 
 
 def test_unknown_kernels_and_too_few_levels_are_refused() -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'absorbing'"):
-        make_categorical_schedule("absorbin")
+    with pytest.raises(UnknownNameError, match="did you mean 'early_absorbing'"):
+        make_categorical_schedule("early_absorbin")
     with pytest.raises(InvalidInputError, match="at least 2"):
-        make_categorical_schedule("uniform", 1)
+        make_categorical_schedule("early_absorbing", 1)
 
 
-@pytest.mark.parametrize("kernel", ["absorbing", "uniform"])
+@pytest.mark.parametrize("kernel", ["early_absorbing", "mask_and_replace"])
 def test_the_tables_of_a_stride_give_the_posterior_of_every_state(kernel: str) -> None:
     """A timestep of all scenes reads tables, one for each scene computes anew: the bits are the same."""
     process = CategoricalProcess(make_categorical_schedule(kernel, 50), 4)

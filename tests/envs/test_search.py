@@ -21,11 +21,13 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from agents.planning import BeamPlanner, BestOfPlanner, GreedyPlanner, Journal, MCTSPlanner, Session
 from agents.priors.testing import tiny_prior
 from rewards.base import RewardOutput
+from rewards.composite import Clip
 from scene_envs.envs import ResetNeededError, SearchEnv, SearchMaskEnv
 from scene_envs.envs.search import node_randomness
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.render import render
 from scene_envs.scene import SceneBatch
+from tests.helpers.batch_reward import AboveTheMean
 
 ID = "scene_envs:SceneEnvs/Search-v0"
 
@@ -382,7 +384,7 @@ def test_an_episode_that_is_over_at_its_reset_ends_with_the_first_step(prior, fr
     assert env.step(0)[1] == 0.0
 
 
-@pytest.mark.parametrize("objective", ["diversity", {"name": "clip", "reward": "diversity", "low": 0.0}])
+@pytest.mark.parametrize("objective", [AboveTheMean(), Clip(AboveTheMean(), low=0.0)])
 def test_an_objective_that_depends_on_the_batch_is_refused(prior, objective):
     with pytest.raises(InvalidInputError, match="by the other scenes of its batch"):
         SearchEnv(prior=prior, objective=objective, branching=3, num_steps=2)

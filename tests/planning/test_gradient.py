@@ -27,7 +27,7 @@ PROCESSES = pytest.mark.parametrize("process", ["mixed", "continuous"])
 def exact_chain(strength: float, residual: bool) -> Tensor:
     """(20000, 1) samples of N(0.2, 0.5²) tilted by exp(strength x), by 50 steps of its exact denoiser."""
     mean, std, count = 0.2, 0.5, 20_000
-    schedule = make_schedule("cosine", 1000)
+    schedule = make_schedule("linear", 1000)
     process = GaussianProcess(schedule, "edm", Preconditioning(torch.tensor([mean]), torch.tensor([std])))
     table = StepTable.spaced(1000, 50)
     alpha, sigma = process.alpha, process.sigma

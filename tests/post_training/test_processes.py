@@ -24,6 +24,7 @@ from agents.utils.process_group import ProcessGroup, is_first_process, launched_
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.errors import InvalidInputError, TrainingError
 from scene_envs.scene import SceneBatch
+from tests.helpers.batch_reward import AboveTheMean
 from tests.helpers.forked import ForkedModule
 from tests.helpers.processes import Run, in_processes, train
 from tests.helpers.small_runs import small_config
@@ -34,7 +35,12 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
     "ddpo_is": (
         "mixed",
         torch.float64,
-        {"algorithm": {"updates": 2, "scenes_per_prompt": 3}, "prompt": TWO, "reward": "diversity", "iterations": 1},
+        {
+            "algorithm": {"updates": 2, "scenes_per_prompt": 3},
+            "prompt": TWO,
+            "reward": AboveTheMean(),
+            "iterations": 1,
+        },
     ),
     "nft": (
         "mixed",

@@ -40,6 +40,7 @@ from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.errors import CorruptFileError, InvalidInputError, TrainingError, UnknownNameError
 from scene_envs.scene import SceneBatch
 from tests.helpers import hostile_rewards
+from tests.helpers.batch_reward import AboveTheMean
 from tests.helpers.forked import forked
 from tests.helpers.small_runs import count_objects, not_a_number, small_config
 
@@ -334,9 +335,9 @@ def test_prompt_match_without_a_prompt_ends_before_anything_is_sampled(tmp_path:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"reward": "diversity", "algorithm.credit": "object"}, r"take algorithm\.credit=scene, or auto"),
+        ({"reward": AboveTheMean(), "algorithm.credit": "object"}, r"take algorithm\.credit=scene, or auto"),
         (
-            {"reward": "diversity", "algorithm.credit": "object", "prompt": "A scene with two cups."},
+            {"reward": AboveTheMean(), "algorithm.credit": "object", "prompt": "A scene with two cups."},
             r"take algorithm\.credit=scene, or auto",
         ),
     ],

@@ -20,7 +20,7 @@ from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type, members_of
 
 TABLE, KINDS = 0, 8
-KERNELS = ("squared_absorbing", "mask_and_replace", "uniform")
+KERNELS = ("squared_absorbing", "mask_and_replace")
 
 
 class WantsTables(torch.nn.Module):
@@ -73,7 +73,9 @@ def test_log_probabilities_are_those_of_the_states_that_can_be_drawn(monkeypatch
     """Over all states of one slot they sum to one, and the table has no share of it."""
     prior = tiny_prior(process="mixed")
     assert isinstance(prior, MixedPrior)
-    monkeypatch.setattr(prior, "categories", CategoricalProcess(make_categorical_schedule("absorbing", 1000), KINDS))
+    monkeypatch.setattr(
+        prior, "categories", CategoricalProcess(make_categorical_schedule("early_absorbing", 1000), KINDS)
+    )
     table = prior.step_table(2)
     x = prior.initial(1, 34, torch.Generator().manual_seed(0))
     step = prior.transition(x, 0, table)
@@ -238,7 +240,9 @@ def union_prior() -> MixedPrior:
     prior = tiny_prior(UNION, process="mixed", slots=20)
     assert isinstance(prior, MixedPrior)
     kinds = prior.num_categories
-    prior.categories = CategoricalProcess(make_categorical_schedule("absorbing", prior.config.num_timesteps), kinds)
+    prior.categories = CategoricalProcess(
+        make_categorical_schedule("early_absorbing", prior.config.num_timesteps), kinds
+    )
     prior._together = True
     prior.denoiser = EveryAssetAlike(kinds)
     return prior

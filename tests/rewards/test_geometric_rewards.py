@@ -16,7 +16,6 @@ from rewards import (
     CategoryCount,
     Clearance,
     Clutter,
-    Diversity,
     Penetration,
     RewardContext,
     RewardOutput,
@@ -28,6 +27,7 @@ from rewards import (
 )
 from scene_envs import SceneBatch, get_grammar, get_scene_type
 from scene_envs.errors import InvalidInputError, UnknownNameError
+from tests.helpers.batch_reward import AboveTheMean
 
 COMPOSITES = {"clip", "product", "weighted_sum"}
 SHELF = [
@@ -36,7 +36,6 @@ SHELF = [
     "penetration",
     "stability",
     "category_count",
-    "diversity",
     "feasible_share",
 ]
 
@@ -65,8 +64,7 @@ def outline_area(kind: str, asset: str) -> float:
 @pytest.mark.parametrize("name", SHELF)
 @pytest.mark.parametrize("scene_type", ["living_room_shelf"])
 def test_they_keep_the_contract_on_a_shelf(name: str, scene_type: str) -> None:
-    clauses = check_reward(name, scene_type)
-    assert ("scores a scene the same alone and in a batch" in clauses) is (name != "diversity")
+    assert "scores a scene the same alone and in a batch" in check_reward(name, scene_type)
 
 
 # -- clutter ---------------------------------------------------------------------------------------
@@ -213,7 +211,7 @@ def test_a_wanted_gap_is_positive(wanted: float) -> None:
         Clearance(wanted=wanted)
 
 
-# -- kinds, diversity --------------------------------------------------------------------------------
+# -- kinds, composites -------------------------------------------------------------------------------
 
 
 def test_kinds_are_counted_in_the_workspace() -> None:
@@ -227,20 +225,10 @@ def test_kinds_are_counted_in_the_workspace() -> None:
         CategoryCount("fruits")(batch, RewardContext())
 
 
-def test_diversity_is_the_mean_distance_to_the_others() -> None:
-    """Cups 10 cm apart cost 0.1 m of at most 0.245 m; a pot has nothing in common with a cup."""
-    scenes = [place(("teacup", 0.0, 0.0, 0.0)), place(("teacup", 0.1, 0.0, 0.0)), place(("teapot", 0.0, 0.0, 0.0))]
-    output = score(Diversity(), SceneBatch.concatenate(scenes))
-    near = 0.1 / 0.245
-    assert output.value.tolist() == pytest.approx([(near + 1) / 2, (near + 1) / 2, 1.0])
-    assert output.terms["nearest"].tolist() == pytest.approx([near, near, 1.0])
-    assert score(Diversity(), scenes[0]).is_valid.tolist() == [False]
-
-
 def test_composites_depend_on_the_batch_when_a_part_does() -> None:
-    assert WeightedSum(["object_count", "diversity"]).depends_on_batch
+    assert WeightedSum(["object_count", AboveTheMean()]).depends_on_batch
     assert not WeightedSum(["object_count", "clutter"]).depends_on_batch
-    assert len(check_reward({"name": "weighted_sum", "rewards": ["object_count", "diversity"]})) == 5
+    assert len(check_reward(WeightedSum(["object_count", AboveTheMean()]))) == 5
 
 
 def test_an_offset_is_added_to_the_value_of_a_sum(cups: SceneBatch) -> None:
