@@ -150,10 +150,6 @@ class DenoisingCore:
             return self.prior.decode(self._x)
         return SceneBatch.from_tensor(self._x, self.scene_type, normalised=self.prior.normalizer)
 
-    def object_mask(self) -> Tensor:
-        """(B, N) int8: slots whose arg-max category is not empty; slots that are not drawn yet count as empty."""
-        return occupied(self._x, self.scene_type)
-
     @property
     def prompts(self) -> tuple[str, ...] | None:
         """The prompt of each episode, or None without prompts."""

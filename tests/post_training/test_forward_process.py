@@ -25,29 +25,13 @@ from rewards import evaluate_reward, make_reward
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from scene_envs.grammars import get_grammar
 from tests.helpers.examples import load_example
+from tests.helpers.forward_losses import gradient, minimum, own_scenes
 from tests.helpers.small_runs import count_objects, small_config
 
 
 @pytest.fixture(scope="module", params=["mixed", "continuous"])
 def prior(request: pytest.FixtureRequest) -> ScenePrior:
     return tiny_prior("dimsum_table", process=request.param)
-
-
-def minimum(loss, start: Tensor, steps: int = 400) -> Tensor:
-    """The argument that minimises ``loss``, by L-BFGS."""
-    x = start.clone().requires_grad_()
-    optimizer = torch.optim.LBFGS(
-        [x], max_iter=steps, tolerance_grad=1e-12, tolerance_change=1e-14, line_search_fn="strong_wolfe"
-    )
-
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        value = loss(x)
-        value.backward()
-        return value
-
-    optimizer.step(closure)
-    return x.detach()
 
 
 class TestGaussianMixture:
@@ -111,17 +95,6 @@ class TestTwoCategories:
         exact = brentq(slope, -20, 20, xtol=1e-12)
         assert self.log_odds_at_minimum(NFTLoss(prior, prior, beta=beta)) == pytest.approx(exact, abs=1e-6)
         assert exact < 0  # the better category gains
-
-
-def gradient(loss: ForwardProcessLoss, scenes: TensorDict) -> Tensor:
-    loss.prior.zero_grad()
-    loss.generator = Generator().manual_seed(3)
-    loss(scenes)["loss_objective"].backward()
-    return torch.cat([p.grad.flatten().double() for p in loss.prior.parameters() if p.grad is not None])
-
-
-def own_scenes(prior: ScenePrior, **advantages: Tensor) -> TensorDict:
-    return TensorDict({"scene": prior.encode(prior.sample(4, num_steps=3, seed=1)), **advantages}, [4])
 
 
 def test_nft_and_awm_have_the_same_gradient_at_the_sampling_policy(prior: ScenePrior) -> None:

@@ -21,8 +21,8 @@ from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from agents.utils.checkpoints import load_checkpoint
 from tests.helpers.examples import load_example
+from tests.helpers.forward_losses import gradient, minimum, own_scenes
 from tests.helpers.small_runs import small_config
-from tests.post_training.test_forward_process import gradient, minimum, own_scenes
 
 
 @pytest.fixture(scope="module")
