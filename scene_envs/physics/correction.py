@@ -590,7 +590,7 @@ def _solved(ends: Tensor, direction: Tensor, needed: Tensor, found: Tensor, limi
 
     ahead, momentum = found, 1.0
     for _ in range(_STEPS):
-        offset = (direction * _at(moved(ahead), ends)).view(6, count).sum(dim=0)
+        offset = (direction * _at(moved(ahead), ends)).sum(dim=0).view(2, -1).sum(dim=0)
         new = torch.addcmul(target, ahead, kept).addcmul_(step, offset, value=-1.0).clamp_(min=0.0)
         following = 0.5 * (1.0 + (1.0 + 4.0 * momentum**2) ** 0.5)
         ahead = torch.lerp(found, new, 1.0 + (momentum - 1.0) / following)
