@@ -555,18 +555,40 @@ class ProgressKeys(Checked):
 
 
 @dataclass
-class PromptKeys(Checked):
+class EngineKeys(Checked):
+    """Engine of the physics.
+
+    Attributes:
+        workers: physics worker processes; 0 computes physics in this process.
+        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
+    """
+
+    workers: Natural = 2
+    physics: str = "auto"
+
+
+@dataclass
+class GuidanceKeys(Checked):
+    """Guidance of the denoiser.
+
+    Attributes:
+        guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
+    """
+
+    guidance: float = 0.0
+
+
+@dataclass
+class PromptKeys(GuidanceKeys):
     """Prompt of the scenes.
 
     Attributes:
         prompt: text that the scenes should match, for priors that read prompts; null for no prompt.
-        guidance: weight of classifier-free guidance, 0 for none; needs a prompt.
         claim_guidance: strength with which scenes are guided to the numbers and places that the prompt gives, 0 for
             none; 2 is a good choice; needs a prompt.
     """
 
     prompt: str | None = None
-    guidance: float = 0.0
     claim_guidance: float = 0.0
 
     def __post_init__(self) -> None:
@@ -576,7 +598,7 @@ class PromptKeys(Checked):
 
 
 @dataclass
-class SamplingKeys(PromptKeys):
+class SamplingKeys(Checked):
     """Sampling of scenes.
 
     Attributes:
@@ -636,22 +658,18 @@ class RewardLimitKeys(Checked):
 
 
 @dataclass
-class OutputKeys(DeviceKeys):
+class OutputKeys(EngineKeys, DeviceKeys):
     """Computation and output.
 
     Attributes:
         output: folder for the files that the command writes.
         pictures: number of scenes in the galleries; 0 draws none.
         batch_size: scenes denoised at once.
-        workers: physics worker processes; 0 computes physics in this process.
-        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
     """
 
     output: str = ""
     pictures: Natural = 12
     batch_size: Count = 64
-    workers: Natural = 2
-    physics: str = "auto"
 
 
 @dataclass

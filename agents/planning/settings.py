@@ -7,8 +7,10 @@ from typing import Any
 
 from agents.configuration.composition import (
     DeviceKeys,
+    EngineKeys,
     PhysicsGuidance,
     PrecisionKeys,
+    PromptKeys,
     SamplingKeys,
     composed,
     named,
@@ -33,11 +35,11 @@ class BudgetKeys:
 
 @composed
 @dataclass
-class SearchConfig(BudgetKeys, SamplingKeys, PrecisionKeys, DeviceKeys):
+class SearchConfig(BudgetKeys, PromptKeys, SamplingKeys, EngineKeys, PrecisionKeys, DeviceKeys):
     """Settings of a search.
 
-    Keys that are not listed are those of :class:`~agents.configuration.composition.SamplingKeys` and
-    :class:`~agents.configuration.composition.DeviceKeys`.
+    Keys that are not listed are those of :class:`~agents.configuration.composition.PromptKeys`,
+    :class:`~agents.configuration.composition.SamplingKeys` and the other bases.
 
     Attributes:
         budget: number of scenes that each search generates; the baseline generates as many. NFE is ``budget *
@@ -57,11 +59,8 @@ class SearchConfig(BudgetKeys, SamplingKeys, PrecisionKeys, DeviceKeys):
         masks: several masks, each written as ``mask``; every action uses one of them. null uses ``mask`` alone.
         objective_scale: objective at which Φ is 1; null takes the largest value that the objective declares, or else
             the number of free slots.
-        workers: physics worker processes; 0 computes physics in this process.
-        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         prompt: text that all scenes should match, for priors that read prompts; the objective gets it too. null for no
             prompt.
-        num_steps: denoiser evaluations per scene.
         physics_guidance: strength, 0 to 1, with which regenerated objects are moved out of overlaps and onto supports
             at the last steps; 0 by default, even for priors that are sampled with physics guidance.
         slots: slots per scene; null takes the number of the scene type.
@@ -77,7 +76,6 @@ class SearchConfig(BudgetKeys, SamplingKeys, PrecisionKeys, DeviceKeys):
     objective_scale: float | None = None
     physics_guidance: PhysicsGuidance = 0.0
     workers: Natural = 0
-    physics: str = "auto"
     planner: PlannerSettings = nested(
         GradientPlanner, folder="planner", option="gradient", kinds=planner_settings, registered=list_planners
     )

@@ -10,10 +10,13 @@ from typing import Annotated, Any, ClassVar, TypeVar
 
 from agents.configuration.composition import (
     OPTIMIZERS,
+    EngineKeys,
+    GuidanceKeys,
     LoggerSettings,
     OptimizerSettings,
     ProgressKeys,
     RewardLimitKeys,
+    SamplingKeys,
     Texts,
     TrainingKeys,
     composed,
@@ -33,7 +36,6 @@ from scene_envs.errors import (
     Nonnegative,
     OneOf,
     Positive,
-    Seed,
     Unlimited,
     at_least,
 )
@@ -371,7 +373,7 @@ class PostTrainLoggerSettings(LoggerSettings):
 
 @composed
 @dataclass
-class PostTrainConfig(TrainingKeys, ProgressKeys, RewardLimitKeys):
+class PostTrainConfig(GuidanceKeys, SamplingKeys, EngineKeys, TrainingKeys, ProgressKeys, RewardLimitKeys):
     """One post-training run.
 
     With DDPO-SF, the gradient that AdamW sees is that of
@@ -382,8 +384,8 @@ class PostTrainConfig(TrainingKeys, ProgressKeys, RewardLimitKeys):
     where ``step_scale = steps with weight > 0 / gradient_steps``. log p is a mean over the random entries of a scene,
     and the pretraining loss is a mean over scenes and entries. The weight is meaningful only with these reductions.
 
-    Keys that are not listed are those of :class:`~agents.configuration.composition.TrainingKeys` and
-    :class:`~agents.configuration.composition.RewardLimitKeys`.
+    Keys that are not listed are those of :class:`~agents.configuration.composition.SamplingKeys`,
+    :class:`~agents.configuration.composition.TrainingKeys` and the other bases.
 
     Attributes:
         prior: prior from which the run starts: a shipped name or a path.
@@ -392,7 +394,6 @@ class PostTrainConfig(TrainingKeys, ProgressKeys, RewardLimitKeys):
         iterations: number of iterations; each samples one batch of scenes.
         batch_size: scenes sampled per iteration.
         workers: physics worker processes; 0 computes physics in this process; ``ray`` uses the CPUs of a Ray cluster.
-        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         recipe: a named set of values for the other keys: ``ours``, ``demo_clutter`` or ``demo_feasible``. Keys that are
             given as well override it.
         output: run folder; a run that was interrupted there is resumed; empty for runs/COMMAND-TIME on the command
@@ -400,8 +401,6 @@ class PostTrainConfig(TrainingKeys, ProgressKeys, RewardLimitKeys):
         prompt: text that the scenes should match, for priors that read prompts: one text, a list such as '["A scene
             with two cups.", "A scene with 9 objects."]', ``data`` for the prompts of the real scenes, or ``grammar``
             for descriptions of grammar scenes; null for no prompt.
-        num_steps: denoising steps per scene.
-        slots: slots per scene, which may exceed the number in training; null takes the number in training.
         guidance: weight of classifier-free guidance in the policy, 0 for none; needs a prompt.
         seed: seed of the initial noise, the chain's noise, the choice of steps and the real scenes.
         algorithm: the post-training algorithm.
@@ -414,10 +413,6 @@ class PostTrainConfig(TrainingKeys, ProgressKeys, RewardLimitKeys):
     iterations: Count = 60
     batch_size: Annotated[int, at_least(2)] = 48
     workers: Any = 0
-    physics: str = "auto"
-    guidance: float = 0.0
-    slots: Count | None = None
-    seed: Seed = 0
     prior: str = "dimsum_table"
     reward: Any = named("object_count", "reward")
     prompt: Texts = None

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior, make_ready
 from agents.cli.run_folder import Run
-from agents.configuration.composition import DrawKeys
-from scene_envs.errors import Checked, Count, InvalidInputError, Natural, PhysicsError, at_least
+from agents.configuration.composition import DrawKeys, EngineKeys
+from scene_envs.errors import Count, InvalidInputError, Natural, PhysicsError, at_least
 
 if TYPE_CHECKING:
     from scene_envs.physics import PhysicsPool
@@ -24,23 +24,19 @@ _OVERLAP = 1e-3
 
 
 @dataclass
-class ProjectConfig(Checked):
+class ProjectConfig(EngineKeys):
     """Scenes made simulation-ready.
 
     Attributes:
         scenes: a scene file, a folder of scene files, the folder of a sample or search run, or a dataset.
         count: number of scenes, from the first; null for all.
         pictures: number of scenes in the galleries; 0 draws none.
-        workers: physics worker processes; 0 computes physics in this process.
-        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         output: folder for ready.safetensors, before.png and ready.png.
     """
 
     scenes: str = ""
     count: Count | None = None
     pictures: Natural = 12
-    workers: Natural = 2
-    physics: str = "auto"
     output: str = ""
 
 
@@ -56,7 +52,7 @@ class VerifyConfig:
 
 
 @dataclass
-class ExportConfig(DrawKeys):
+class ExportConfig(DrawKeys, EngineKeys):
     """Scenes for simulators and viewers.
 
     Attributes:
@@ -69,8 +65,6 @@ class ExportConfig(DrawKeys):
         project: make the scenes simulation-ready first (project out of penetration, then settle).
         friction: coefficient of friction of all surfaces.
         randomization: YAML file with distributions of mass, friction and color; empty for none.
-        workers: physics worker processes; 0 computes physics in this process.
-        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         output: folder for assets/ and scene_000/, scene_001/, ...
     """
 
@@ -81,8 +75,6 @@ class ExportConfig(DrawKeys):
     project: bool = False
     friction: Annotated[float, at_least(0)] = 0.6
     randomization: str = ""
-    workers: Natural = 2
-    physics: str = "auto"
     output: str = ""
 
 

@@ -6,12 +6,12 @@ from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 from agents.cli.run_folder import Run
-from agents.configuration.composition import ProgressKeys, named
+from agents.configuration.composition import EngineKeys, ProgressKeys, named
 from scene_envs.errors import Count, Natural, OneOf, Seed
 
 
 @dataclass
-class GenerateConfig(ProgressKeys):
+class GenerateConfig(EngineKeys, ProgressKeys):
     """A dataset from a grammar.
 
     Attributes:
@@ -21,7 +21,6 @@ class GenerateConfig(ProgressKeys):
         workers: worker processes; 0 uses this process. With Ray, the number of CPUs of a cluster that this command
             starts.
         verify: keep only scenes that pass physics.
-        physics: engine of motion: bullet, mujoco, warp, or auto for bullet where it is installed, else mujoco.
         shard_size: scenes per parquet file.
         backend: processes, for processes of this machine, or ray.
         address: address of a running Ray cluster; null starts one on this machine.
@@ -32,7 +31,6 @@ class GenerateConfig(ProgressKeys):
     count: Count = 1000
     seed: Seed = 0
     workers: Natural = 2
-    physics: str = "auto"
     verify: bool = True
     shard_size: Count = 2000
     backend: Annotated[str, OneOf(("processes", "ray"))] = "processes"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from agents.cli.commands.export import export_scenes, keep_verified
 from agents.cli.commands.scenes import draw, draw_scenes, load_prior, make_ready, object_counts, reward_figures
 from agents.cli.run_folder import Run
-from agents.configuration.composition import DrawKeys, OutputKeys, RewardLimitKeys, SamplingKeys, named
+from agents.configuration.composition import DrawKeys, OutputKeys, PromptKeys, RewardLimitKeys, SamplingKeys, named
 from scene_envs.errors import Count, InvalidInputError, OneOf, at_least
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ _SAMPLED = ("prompt", "guidance", "claim_guidance", "eta", "slots", "batch_size"
 
 
 @dataclass
-class SampleConfig(SamplingKeys, DrawKeys, RewardLimitKeys, OutputKeys):
+class SampleConfig(PromptKeys, SamplingKeys, DrawKeys, RewardLimitKeys, OutputKeys):
     """Scenes from a prior.
 
     Attributes:
