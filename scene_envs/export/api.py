@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from scene_envs.assets.base import identifier
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.export.formats import _FORMATS, resolve_formats
-from scene_envs.export.placed import AssetFiles, identifier, place
+from scene_envs.export.placed import AssetFiles, place
 from scene_envs.export.randomization import randomize, read_randomization
 from scene_envs.files import write_json
 from scene_envs.physics.parts import FRICTION

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from agents.cli import main
 from agents.priors import ScenePrior
 from agents.priors.testing import tiny_prior
+from scene_envs.assets.base import identifiers
 from scene_envs.datasets import SceneDataset
 from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
 from scene_envs.export import AssetFiles, export, formats, list_formats, register_format
@@ -27,7 +28,6 @@ from scene_envs.export.placed import (
     angle_axis,
     exact_rotations,
     face_colors,
-    identifiers,
     quaternion,
     textured_mesh,
     visual_mesh,
