@@ -744,7 +744,7 @@ def summary(model: Model) -> tuple[Any, ...]:
     shapes = [
         (s.kind, s.size, s.pose.tobytes(), s.color, s.is_convex, s.part) for s in model.visuals + model.collisions
     ]
-    inertials = [(i.mass, i.center_of_mass.tobytes(), i.inertia.tobytes()) for i in model.inertials]
+    inertials = [(i.mass, i.center_of_mass.tobytes(), i.inertia.tobytes()) for _, i in model.inertials]
     return shapes, inertials, model.static, model.notes
 
 

@@ -237,9 +237,7 @@ def weigh(
         return Weight(even, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
     inertia = 0.5 * (inertia + inertia.T)
     low, middle, high = np.linalg.eigvalsh(inertia)
-    inertia += max(0.0, high * (1.0 + 1e-9) - low - middle) * np.eye(
-        3
-    )  # of a thin plate, which rounding makes impossible
+    inertia += max(0.0, high * (1.0 + 1e-9) - low - middle) * np.eye(3)  # MuJoCo refuses a plate by a rounding
     return Weight(MassProperties(mass, given.center_of_mass, inertia), notes, ())
 
 
@@ -439,7 +437,7 @@ def _articulate(
             pose[:3, 3] += 0.0 if parent else shift
             link += "_link" * (link == entry.name)
             joints.append(dataclasses.replace(joint, name=titles[joint.name], link=link, parent=parent, pose=pose))
-        back = np.linalg.inv(frames[row]) if row else pose_of(shift, np.eye(3))
+        back: Array = np.linalg.inv(frames[row]) if row else pose_of(shift, np.eye(3))
         own = [piece for piece in pieces if rows[piece.link] == row]
         parts = [part for piece in own for part in piece.parts]
         even = merged_inertial([piece.solid for piece in own])
@@ -447,14 +445,24 @@ def _articulate(
         name = joints[-1].link if row else "base"
         warnings += [f"link {name!r}: {text}" for text in weight.warnings if row]
         mass, center, inertia = moved_inertial(back, weight.properties)
-        look = moved(
-            join(*(m for link, meshes in drawn if rows[link] == row for m in meshes)), back[:3, :3], back[:3, 3]
-        )
+        look = join(*(mesh for link, meshes in drawn if rows[link] == row for mesh in meshes))
         moved_parts = [ConvexPart(part.vertices @ back[:3, :3].T, part.faces) for part in parts]
         fine = tuple(_shifted(part, back[:3, 3]) for part in moved_parts)
         color, is_base = entry.color or (128, 128, 128), not row
         bodies.append(
-            Asset(f"{entry.name}/{name}", name, name, mass, center, inertia, look, fine, fine, color, is_base)
+            Asset(
+                f"{entry.name}/{name}",
+                name,
+                name,
+                mass,
+                center,
+                inertia,
+                moved(look, back[:3, :3], back[:3, 3]),
+                fine,
+                fine,
+                color,
+                is_base,
+            )
         )
     return tuple(joints), tuple(bodies)
 
@@ -482,11 +490,12 @@ def _scaled(model: Model, entry: AssetEntry) -> Model:
         (k, MassProperties(i.mass * scale**3, scale * turn @ i.center_of_mass, scale**5 * turn @ i.inertia @ turn.T))
         for k, i in model.inertials
     )
+    far = {"prismatic": scale, "revolute": 1.0}
     joints = tuple(
         dataclasses.replace(
             j,
             pose=pose_of(scale * turn @ j.pose[:3, 3], turn @ j.pose[:3, :3]),
-            limits=tuple(x * (scale if j.kind == "prismatic" else 1.0) for x in j.limits),
+            limits=(j.limits[0] * far[j.kind], j.limits[1] * far[j.kind]),
         )
         for j in model.joints
     )

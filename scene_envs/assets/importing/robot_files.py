@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -44,6 +44,7 @@ _TO_WORLD = "a joint holds it at `world`"
 _LEFT_OUT = ("nu actuators", "nsensor sensors", "ntendon tendons", "neq constraints", "nflex flexes", "nskin skins",
              "nplugin plugins", "ngravcomp gravcomp")  # fmt: skip
 """The sizes of a model in MuJoCo that count what an asset does not have."""
+_KINDS: dict[int, Literal["prismatic", "revolute"]] = {2: "prismatic", 3: "revolute"}  # of MuJoCo
 _OF_JOINTS = ("limit", "dynamics", "mimic")
 _NOT_OF_USD = ("kinematicEnabled", "velocity", "angularVelocity", "restitution")
 """Properties of UsdPhysics that an asset does not have."""
@@ -126,8 +127,8 @@ class _Reading:
         elif not length or min(rubs) < 0:
             fault = f"has the axis {vector.tolist()} and the damping and friction {rubs}; 0 0 1, 0 and 0 would do"
         else:
-            kinds = "prismatic" if kind == "prismatic" else "revolute"
-            found = Joint(element.get("name", "?"), link, 0, kinds, pose, turn @ vector / length, ends, *rubs)
+            moves: Literal["prismatic", "revolute"] = "prismatic" if kind == "prismatic" else "revolute"
+            found = Joint(element.get("name", "?"), link, 0, moves, pose, turn @ vector / length, ends, *rubs)
             self.frozen += _why_still(found)
             return None if _why_still(found) else found
         self.faults.append(f"{self.path}: {where} {fault}")
@@ -513,7 +514,7 @@ def read_mjcf(path: Path) -> Model:
 
 
 def _hinges(
-    model: Any, data: Any, root: int, bodies: list[int], base: Array
+    model: Any, data: Any, root: int, bodies: list[int], base: Any
 ) -> tuple[dict[int, int], tuple[Joint, ...], list[str]]:
     """For each body the number of the joint that moves it, the joints, and the names of frozen ones."""
     rows, joints, frozen = dict.fromkeys(bodies, 0), list[Joint](), list[str]()
@@ -523,19 +524,18 @@ def _hinges(
         rows[body] = 0 if body == root else parent
         own = [j for j in range(model.njnt) if model.jnt_bodyid[j] == body and model.jnt_type[j] != 0]
         names = [model.joint(j).name or f"joint_{j}" for j in own]
-        kinds = [("ball", "prismatic", "revolute")[model.jnt_type[j] - 1] for j in own]
-        if len(own) != 1 or body == root or kinds[0] == "ball" or own[0] in follows:
-            why = ["of the first body"] if body == root else [k for k in kinds if k == "ball"] or ["several of a body"]
-            why = ["mimic"] if own and own[0] in follows else why
-            frozen += [f"{name} ({why[0]})" for name in names]
+        if len(own) != 1 or body == root or model.jnt_type[own[0]] == 1 or own[0] in follows:
+            ball = "ball" if own and model.jnt_type[own[0]] == 1 else "several of a body"
+            why = "of the first body" if body == root else "mimic" if follows.intersection(own) else ball
+            frozen += [f"{name} ({why})" for name in names]
             continue
         (j,) = own
         dof, zero = model.jnt_dofadr[j], model.qpos0[model.jnt_qposadr[j]]
         limits = tuple((model.jnt_range[j] - zero).tolist()) if model.jnt_limited[j] else (-np.inf, np.inf)
-        pose = base @ pose_of(data.xanchor[j], data.xmat[body].reshape(3, 3))
+        pose, kind = base @ pose_of(data.xanchor[j], data.xmat[body].reshape(3, 3)), _KINDS[int(model.jnt_type[j])]
         rubs = float(model.dof_damping[dof]), float(model.dof_frictionloss[dof])
         link = model.body(body).name or f"body_{body}"
-        joint = Joint(names[0], link, parent, kinds[0], pose, model.jnt_axis[j].astype(float), limits, *rubs)
+        joint = Joint(names[0], link, parent, kind, pose, model.jnt_axis[j].astype(float), limits, *rubs)
         frozen += _why_still(joint)
         if not _why_still(joint):
             joints.append(joint)
