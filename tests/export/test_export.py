@@ -32,7 +32,7 @@ from scene_envs.export.placed import (
     textured_mesh,
     visual_mesh,
 )
-from scene_envs.export.sdf import roll_pitch_yaw
+from scene_envs.export.urdf import roll_pitch_yaw
 from scene_envs.normalizer import Normalizer
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch

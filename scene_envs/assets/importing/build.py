@@ -446,24 +446,11 @@ def _articulate(
         warnings += [f"link {name!r}: {text}" for text in weight.warnings if row]
         mass, center, inertia = moved_inertial(back, weight.properties)
         look = join(*(mesh for link, meshes in drawn if rows[link] == row for mesh in meshes))
-        moved_parts = [ConvexPart(part.vertices @ back[:3, :3].T, part.faces) for part in parts]
-        fine = tuple(_shifted(part, back[:3, 3]) for part in moved_parts)
-        color, is_base = entry.color or (128, 128, 128), not row
-        bodies.append(
-            Asset(
-                f"{entry.name}/{name}",
-                name,
-                name,
-                mass,
-                center,
-                inertia,
-                moved(look, back[:3, :3], back[:3, 3]),
-                fine,
-                fine,
-                color,
-                is_base,
-            )
-        )
+        look = moved(look, back[:3, :3], back[:3, 3])
+        turned = [ConvexPart(part.vertices @ back[:3, :3].T, part.faces) for part in parts]
+        fine = tuple(_shifted(part, back[:3, 3]) for part in turned)
+        looks = {"visual": look, "fine": fine, "coarse": fine, "color": entry.color or (128, 128, 128)}
+        bodies.append(Asset(f"{entry.name}/{name}", name, name, mass, center, inertia, static=not row, **looks))
     return tuple(joints), tuple(bodies)
 
 
