@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import RECIPES, Asset
-from scene_envs.export.placed import AssetFiles, PlacedScene, face_colors, quaternion, visual_mesh
+from scene_envs.export.placed import AssetFiles, PlacedObject, PlacedScene, face_colors, quaternion, visual_mesh
 from scene_envs.export.urdf import relative
 from scene_envs.physics.mujoco import SOLIMP, SOLREF, TIMESTEP
 from scene_envs.physics.parts import GRAVITY, principal_inertia
@@ -46,7 +47,8 @@ _THUMBNAIL = 256
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene_000.usda`` beside the folder ``assets``, so that every reference stays below the file's own folder.
 
-    One prim under ``/World`` per object; welded ones are colliders without a rigid body; units m and kg, z up.
+    One prim under ``/World`` per object; welded ones are colliders without a rigid body; units m and kg, z up. With
+    joints, the prim is an articulation of a prim for each link, and a fixed joint holds the first at the world.
     """
     from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics
 
@@ -61,23 +63,75 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     _apply(physics, "MjcSceneAPI", _SCENE)
     _apply(physics, "NewtonSceneAPI", {"newton:timeStepsPerSecond": ("int", round(1.0 / TIMESTEP))})
     for item in scene.objects:
-        body = UsdGeom.Xform.Define(stage, f"/World/{item.name}")
-        asset_file = files.once(item.asset, "usd", partial(_write_asset, item.asset, files, scene.scene_type))
-        body.GetPrim().GetReferences().AddReference(Sdf.Reference(f"./{relative(asset_file, path.parent)}"))
-        body.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*item.translation.tolist()))
-        w, x, y, z = item.quaternion.tolist()
-        body.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
-        if item.welded:  # MuJoCo and Newton read rigidBodyEnabled=false as a free body
-            body.GetPrim().RemoveAPI(UsdPhysics.RigidBodyAPI)
-            body.GetPrim().RemoveAPI(UsdPhysics.MassAPI)
-        elif item.mass != item.asset.mass:
-            _apply_body(body.GetPrim(), replace(item.asset, mass=item.mass, inertia=item.inertia))
-        if item.friction != files.friction:
-            surface = UsdPhysics.MaterialAPI.Apply(stage.OverridePrim(f"/World/{item.name}/surface"))
-            surface.CreateStaticFrictionAttr(item.friction)
-            surface.CreateDynamicFrictionAttr(item.friction)
+        _place(stage, f"/World/{item.name}", item.matrix)
+        names, frames = [item.name], [np.eye(4)]
+        for joint in item.joints:
+            names.append(f"{item.name}/{joint.link}")
+            frames.append(frames[joint.parent] @ joint.pose)
+        if item.joints:
+            names[0] = f"{item.name}/{files.name(item.asset)}"
+            first, *_ = (_place(stage, f"/World/{n}", frame) for n, frame in zip(names, frames, strict=True))
+            UsdPhysics.ArticulationRootAPI.Apply(first.GetPrim())  # MuJoCo takes any other prim that has it for a body
+            _add_joints(stage, item, [f"/World/{name}" for name in names])
+        for name, piece in zip(names, item.pieces, strict=True):
+            prim = stage.GetPrimAtPath(f"/World/{name}")
+            asset_file = files.once(piece.asset, "usd", partial(_write_asset, piece.asset, files, scene.scene_type))
+            prim.GetReferences().AddReference(Sdf.Reference(f"./{relative(asset_file, path.parent)}"))
+            if item.welded and not item.joints:  # MuJoCo and Newton read rigidBodyEnabled=false as a free body
+                prim.RemoveAPI(UsdPhysics.RigidBodyAPI)
+                prim.RemoveAPI(UsdPhysics.MassAPI)
+            elif piece.mass != piece.asset.mass:
+                _apply_body(prim, replace(piece.asset, mass=piece.mass, inertia=piece.inertia))
+            if item.friction != files.friction:
+                surface = UsdPhysics.MaterialAPI.Apply(stage.OverridePrim(f"/World/{name}/surface"))
+                surface.CreateStaticFrictionAttr(item.friction)
+                surface.CreateDynamicFrictionAttr(item.friction)
     stage.GetRootLayer().Save()
     return path
+
+
+def _place(stage: Any, path: str, pose: Array) -> Any:
+    """A prim at a pose (4, 4) in the frame of the prim above it."""
+    from pxr import Gf, UsdGeom
+
+    prim = UsdGeom.Xform.Define(stage, path)
+    prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*pose[:3, 3].tolist()))
+    prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(*quaternion(pose[:3, :3]).tolist()))
+    return prim
+
+
+def _add_joints(stage: Any, item: PlacedObject, paths: list[str]) -> None:
+    """The joints of the links at these paths, below the object; the first link is held at the world."""
+    from pxr import Gf, Sdf, UsdGeom, UsdPhysics
+
+    def connect(joint: Any, ends: list[str], frames: list[Array]) -> Any:
+        for end, relation in zip(ends, (joint.CreateBody0Rel(), joint.CreateBody1Rel()), strict=True):
+            if end:
+                relation.SetTargets([end])
+        for index, frame in enumerate(frames):
+            place, turn = Gf.Vec3f(*frame[:3, 3].tolist()), Gf.Quatf(*quaternion(frame[:3, :3]).tolist())
+            joint.GetPrim().GetAttribute(f"physics:localPos{index}").Set(place)
+            joint.GetPrim().GetAttribute(f"physics:localRot{index}").Set(turn)
+        return joint
+
+    folder = f"/World/{item.name}/joints"
+    UsdGeom.Scope.Define(stage, folder)
+    weld = UsdPhysics.FixedJoint.Define(stage, f"{folder}/{paths[0].rpartition('/')[2]}_weld")
+    connect(weld, ["", paths[0]], [item.matrix, np.eye(4)])
+    for path, joint in zip(paths[1:], item.joints, strict=True):
+        is_slide = joint.kind == "prismatic"
+        turn = np.eye(4)  # from the x axis to that of the joint
+        turn[:3, :3] = Rotation.align_vectors(joint.axis, (1.0, 0.0, 0.0))[0].as_matrix()
+        kind = UsdPhysics.PrismaticJoint if is_slide else UsdPhysics.RevoluteJoint
+        ends = [paths[joint.parent], path]
+        made = connect(kind.Define(stage, f"{folder}/{joint.name}"), ends, [joint.pose @ turn, turn])
+        made.CreateAxisAttr(UsdPhysics.Tokens.x)
+        degrees = 1.0 if is_slide else np.degrees(1.0)
+        made.CreateLowerLimitAttr(joint.limits[0] * degrees)
+        made.CreateUpperLimitAttr(joint.limits[1] * degrees)
+        made.GetPrim().AddAppliedSchema("NewtonJointAPI")  # MuJoCo reads it as well
+        for key, value in (("damping", joint.damping / degrees), ("friction", joint.friction)):
+            made.GetPrim().CreateAttribute(f"newton:{key}", Sdf.ValueTypeNames.Float, False).Set(value)
 
 
 def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder: Path) -> Path:
@@ -126,7 +180,8 @@ def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder:
         binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
     stage.GetRootLayer().customLayerData = _metadata(asset, code)
     stage.GetRootLayer().Save()
-    _write_thumbnail(asset, scene_type, path.parent / ".thumbs" / "256x256" / f"{path.name}.png")
+    if asset.name in scene_type.library.names:
+        _write_thumbnail(asset, scene_type, path.parent / ".thumbs" / "256x256" / f"{path.name}.png")
     return path
 
 

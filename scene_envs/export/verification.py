@@ -236,7 +236,7 @@ def _drake(path: Path) -> Objects:
     diagram = builder.Build()
     simulator = drake.Simulator(diagram)
     context = plant.GetMyContextFromRoot(simulator.get_context())
-    bodies = {}
+    bodies: dict[str, Any] = {}
     for model in models:
         first, *links = map(plant.get_body, plant.GetBodyIndices(model))
         name = plant.GetModelInstanceName(model)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from scene_envs.arrays import Array
-from scene_envs.assets.base import Asset, ConvexPart, Joint, bounds_of, identifiers, regular_plural
+from scene_envs.assets.base import Asset, ConvexPart, Joint, bounds_of, identifier, identifiers, regular_plural
 from scene_envs.assets.importing.limits import seconds_left
 from scene_envs.assets.importing.mesh_files import (
     MESH_SUFFIXES,
@@ -435,7 +435,7 @@ def _articulate(
             parent, link = rows[joint.parent], names[joint.link]
             pose = np.linalg.inv(frames[parent]) @ joint.pose
             pose[:3, 3] += 0.0 if parent else shift
-            link += "_link" * (link == entry.name)
+            link += "_link" * (link in (identifier(entry.name), "joints"))  # names that exports give
             joints.append(dataclasses.replace(joint, name=titles[joint.name], link=link, parent=parent, pose=pose))
         back: Array = np.linalg.inv(frames[row]) if row else pose_of(shift, np.eye(3))
         own = [piece for piece in pieces if rows[piece.link] == row]
@@ -449,7 +449,7 @@ def _articulate(
         look = moved(look, back[:3, :3], back[:3, 3])
         turned = [ConvexPart(part.vertices @ back[:3, :3].T, part.faces) for part in parts]
         fine = tuple(_shifted(part, back[:3, 3]) for part in turned)
-        looks = {"visual": look, "fine": fine, "coarse": fine, "color": entry.color or (128, 128, 128)}
+        looks: dict[str, Any] = {"visual": look, "fine": fine, "coarse": fine, "color": entry.color or (128, 128, 128)}
         bodies.append(Asset(f"{entry.name}/{name}", name, name, mass, center, inertia, static=not row, **looks))
     return tuple(joints), tuple(bodies)
 
