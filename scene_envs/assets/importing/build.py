@@ -437,7 +437,7 @@ def _articulate(
             pose[:3, 3] += 0.0 if parent else shift
             link += "_link" * (link in (identifier(entry.name), "joints"))  # names that exports give
             joints.append(dataclasses.replace(joint, name=titles[joint.name], link=link, parent=parent, pose=pose))
-        back: Array = np.linalg.inv(frames[row]) if row else pose_of(shift, np.eye(3))
+        back: Any = np.linalg.inv(frames[row]) if row else pose_of(shift, np.eye(3))
         own = [piece for piece in pieces if rows[piece.link] == row]
         parts = [part for piece in own for part in piece.parts]
         even = merged_inertial([piece.solid for piece in own])
