@@ -81,18 +81,19 @@ class PlacedObject:
         """
         if not self.joints:
             return (self,)
-        base, *links = (replace(self, asset=b, mass=b.mass, inertia=b.inertia) for b in self.asset.bodies)
-        placed = (
-            replace(
-                piece,
-                name=f"{self.name}/{joint.link}",
-                welded=False,
-                translation=joint.pose[:3, 3],
-                rotation=joint.pose[:3, :3],
-            )
-            for piece, joint in zip(links, self.joints, strict=True)
-        )
-        return (base, *placed)
+        found = [replace(self, asset=b, mass=b.mass, inertia=b.inertia) for b in self.asset.bodies]
+        for row, joint in enumerate(self.joints, start=1):
+            place = {"translation": joint.pose[:3, 3], "rotation": joint.pose[:3, :3]}
+            found[row] = replace(found[row], name=f"{self.name}/{joint.link}", welded=False, **place)
+        return tuple(found)
+
+    @cached_property
+    def frames(self) -> list[Array]:
+        """(4, 4) of each piece in the frame of the object."""
+        found = [np.eye(4)]
+        for joint in self.joints:
+            found.append(found[joint.parent] @ joint.pose)
+        return found
 
 
 @dataclass(frozen=True, eq=False)

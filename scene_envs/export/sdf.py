@@ -33,11 +33,10 @@ def _add_model(world: ET.Element, item: PlacedObject, files: AssetFiles, folder:
     _text(model, "pose", _pose(item.matrix))
     if item.welded and not item.joints:
         _text(model, "static", "true")
-    names, frames = [files.name(item.asset), *(joint.link for joint in item.joints)], [np.eye(4)]
+    names = [files.name(item.asset), *(joint.link for joint in item.joints)]
     _add_link(model, names[0], item.pieces[0], files, folder)
     for index, (joint, piece) in enumerate(zip(item.joints, item.pieces[1:], strict=True)):
-        frames.append(frames[joint.parent] @ joint.pose)
-        _text(_add_link(model, joint.link, piece, files, folder), "pose", _pose(frames[-1]))
+        _text(_add_link(model, joint.link, piece, files, folder), "pose", _pose(item.frames[index + 1]))
         if not index:  # a static model has no joints that move
             _add_joint(model, f"{item.name}_weld", "fixed", "world", names[0])
         name = joint.name + "_joint" * (joint.name in names)  # joints and links share their names

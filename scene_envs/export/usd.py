@@ -63,18 +63,15 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     _apply(physics, "MjcSceneAPI", _SCENE)
     _apply(physics, "NewtonSceneAPI", {"newton:timeStepsPerSecond": ("int", round(1.0 / TIMESTEP))})
     for item in scene.objects:
-        _place(stage, f"/World/{item.name}", item.matrix)
-        names, frames = [item.name], [np.eye(4)]
-        for joint in item.joints:
-            names.append(f"{item.name}/{joint.link}")
-            frames.append(frames[joint.parent] @ joint.pose)
+        prims = [_place(stage, f"/World/{item.name}", item.matrix)]
         if item.joints:
-            names[0] = f"{item.name}/{files.name(item.asset)}"
-            first, *_ = (_place(stage, f"/World/{n}", frame) for n, frame in zip(names, frames, strict=True))
-            UsdPhysics.ArticulationRootAPI.Apply(first.GetPrim())  # MuJoCo takes any other prim that has it for a body
-            _add_joints(stage, item, [f"/World/{name}" for name in names])
-        for name, piece in zip(names, item.pieces, strict=True):
-            prim = stage.GetPrimAtPath(f"/World/{name}")
+            names = [files.name(item.asset), *(joint.link for joint in item.joints)]
+            prims = [
+                _place(stage, f"/World/{item.name}/{name}", frame)
+                for name, frame in zip(names, item.frames, strict=True)
+            ]
+            _add_joints(stage, item, [prim.GetPath() for prim in prims])
+        for prim, piece in zip(prims, item.pieces, strict=True):
             asset_file = files.once(piece.asset, "usd", partial(_write_asset, piece.asset, files, scene.scene_type))
             prim.GetReferences().AddReference(Sdf.Reference(f"./{relative(asset_file, path.parent)}"))
             if item.welded and not item.joints:  # MuJoCo and Newton read rigidBodyEnabled=false as a free body
@@ -83,7 +80,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
             elif piece.mass != piece.asset.mass:
                 _apply_body(prim, replace(piece.asset, mass=piece.mass, inertia=piece.inertia))
             if item.friction != files.friction:
-                surface = UsdPhysics.MaterialAPI.Apply(stage.OverridePrim(f"/World/{name}/surface"))
+                surface = UsdPhysics.MaterialAPI.Apply(stage.OverridePrim(prim.GetPath().AppendChild("surface")))
                 surface.CreateStaticFrictionAttr(item.friction)
                 surface.CreateDynamicFrictionAttr(item.friction)
     stage.GetRootLayer().Save()
@@ -97,41 +94,38 @@ def _place(stage: Any, path: str, pose: Array) -> Any:
     prim = UsdGeom.Xform.Define(stage, path)
     prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*pose[:3, 3].tolist()))
     prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(*quaternion(pose[:3, :3]).tolist()))
-    return prim
+    return prim.GetPrim()
 
 
-def _add_joints(stage: Any, item: PlacedObject, paths: list[str]) -> None:
-    """The joints of the links at these paths, below the object; the first link is held at the world."""
+def _add_joints(stage: Any, item: PlacedObject, paths: list[Any]) -> None:
+    """The joints of the links at these paths, below the object, and one that holds the first at the world."""
     from pxr import Gf, Sdf, UsdGeom, UsdPhysics
 
-    def connect(joint: Any, ends: list[str], frames: list[Array]) -> Any:
-        for end, relation in zip(ends, (joint.CreateBody0Rel(), joint.CreateBody1Rel()), strict=True):
-            if end:
-                relation.SetTargets([end])
-        for index, frame in enumerate(frames):
-            place, turn = Gf.Vec3f(*frame[:3, 3].tolist()), Gf.Quatf(*quaternion(frame[:3, :3]).tolist())
-            joint.GetPrim().GetAttribute(f"physics:localPos{index}").Set(place)
-            joint.GetPrim().GetAttribute(f"physics:localRot{index}").Set(turn)
-        return joint
-
-    folder = f"/World/{item.name}/joints"
-    UsdGeom.Scope.Define(stage, folder)
-    weld = UsdPhysics.FixedJoint.Define(stage, f"{folder}/{paths[0].rpartition('/')[2]}_weld")
-    connect(weld, ["", paths[0]], [item.matrix, np.eye(4)])
+    UsdPhysics.ArticulationRootAPI.Apply(stage.GetPrimAtPath(paths[0]))  # MuJoCo takes a prim of no link for a body
+    folder = UsdGeom.Scope.Define(stage, f"/World/{item.name}/joints").GetPath()
+    weld = UsdPhysics.FixedJoint.Define(stage, folder.AppendChild(f"{paths[0].name}_weld"))
+    made: list[tuple[Any, list[Any], Array, Array]] = [(weld, paths[:1], item.matrix, np.eye(4))]
     for path, joint in zip(paths[1:], item.joints, strict=True):
         is_slide = joint.kind == "prismatic"
+        kind = UsdPhysics.PrismaticJoint if is_slide else UsdPhysics.RevoluteJoint
+        found = kind.Define(stage, folder.AppendChild(joint.name))
         turn = np.eye(4)  # from the x axis to that of the joint
         turn[:3, :3] = Rotation.align_vectors(joint.axis, (1.0, 0.0, 0.0))[0].as_matrix()
-        kind = UsdPhysics.PrismaticJoint if is_slide else UsdPhysics.RevoluteJoint
-        ends = [paths[joint.parent], path]
-        made = connect(kind.Define(stage, f"{folder}/{joint.name}"), ends, [joint.pose @ turn, turn])
-        made.CreateAxisAttr(UsdPhysics.Tokens.x)
+        made.append((found, [paths[joint.parent], path], joint.pose @ turn, turn))
         degrees = 1.0 if is_slide else np.degrees(1.0)
-        made.CreateLowerLimitAttr(joint.limits[0] * degrees)
-        made.CreateUpperLimitAttr(joint.limits[1] * degrees)
-        made.GetPrim().AddAppliedSchema("NewtonJointAPI")  # MuJoCo reads it as well
+        found.CreateAxisAttr(UsdPhysics.Tokens.x)
+        found.CreateLowerLimitAttr(joint.limits[0] * degrees)
+        found.CreateUpperLimitAttr(joint.limits[1] * degrees)
+        found.GetPrim().AddAppliedSchema("NewtonJointAPI")  # MuJoCo reads it as well
         for key, value in (("damping", joint.damping / degrees), ("friction", joint.friction)):
-            made.GetPrim().CreateAttribute(f"newton:{key}", Sdf.ValueTypeNames.Float, False).Set(value)
+            found.GetPrim().CreateAttribute(f"newton:{key}", Sdf.ValueTypeNames.Float, False).Set(value)
+    for found, ends, *frames in made:
+        for end, relation in zip(reversed(ends), (found.CreateBody1Rel(), found.CreateBody0Rel()), strict=False):
+            relation.SetTargets([end])
+        for index, frame in enumerate(frames):
+            place, axes = Gf.Vec3f(*frame[:3, 3].tolist()), Gf.Quatf(*quaternion(frame[:3, :3]).tolist())
+            found.GetPrim().GetAttribute(f"physics:localPos{index}").Set(place)
+            found.GetPrim().GetAttribute(f"physics:localRot{index}").Set(axes)
 
 
 def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder: Path) -> Path:

@@ -391,7 +391,7 @@ def test_what_cannot_move_is_frozen_and_named(tmp_path: Path, file: str, text: s
     [
         ("", "joint 'hinge' is revolute and has no <limit>; give it lower and upper, or make it continuous or fixed"),
         ('<limit lower="1" upper="-1"/>', "joint 'hinge' has a lower limit of 1 above its upper one of -1; exchange"),
-        ('<limit lower="none"/>', "limit of joint 'hinge' is 'none', which is not numbers"),
+        ('<limit lower="none"/>', "lower of joint 'hinge' is 'none', which is not numbers"),
     ],
 )
 def test_wrong_limits_are_an_error_of_a_welded_asset(tmp_path: Path, hinge: str, words: str) -> None:

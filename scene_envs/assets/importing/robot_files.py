@@ -102,58 +102,52 @@ class _Reading:
         """The joint that moves ``link``, with its pose (4, 4) in the model and the rotation (3, 3) of its axis to the
         frame of this pose; None for a fixed one, and for one that is frozen and therefore noted.
         """
-        kind, where, is_urdf = element.get("type", ""), f"joint {element.get('name', '?')!r}", self.kind == "URDF"
-        axis = element.find("axis")
+        kind, name, is_urdf = element.get("type", ""), element.get("name", "?"), self.kind == "URDF"
+        axis, where = element.find("axis"), f"joint {name!r}"
         owner = element if is_urdf else axis
         limit, dynamics, mimic = (None if owner is None else owner.find(tag) for tag in _OF_JOINTS)
-        if kind == "fixed":
-            return None
         if kind not in ("revolute", "continuous", "prismatic") or mimic is not None:
-            self.frozen.append(f"{element.get('name', '?')} ({kind if mimic is None else 'mimic'})")
+            self.frozen += [] if kind == "fixed" else [f"{name} ({kind if mimic is None else 'mimic'})"]
             return None
+
+        def number(key: str, where_from: Element | None, default: float) -> float:
+            text = _text(where_from, key) or ""
+            plain = numbers(None if "inf" in text else text, 1, self.path, f"{key} of {where}", (default,))[0]
+            value = float(text) if text.strip(" +-") == "inf" else float(plain)
+            return value if abs(value) < 1e16 else float(np.copysign(np.inf, value))  # as SDFormat says
+
         default = (1.0, 0.0, 0.0) if is_urdf else (0.0, 0.0, 1.0)
         vector = numbers(_text(axis, "xyz"), 3, self.path, f"axis of {where}", default)
-        ends = (-np.inf, np.inf) if kind == "continuous" or not is_urdf else (0.0, 0.0)
-        if kind != "continuous":
-            texts = [(_text(limit, key) or "").lower() for key in ("lower", "upper")]
-            values = zip(texts, ends, strict=True)
-            ends = tuple(v if "inf" in t else self._number(t, v, f"limit of {where}") for t, v in values)  # type: ignore[assignment]
-        rubs = [self._number(_text(dynamics, key), 0.0, f"{key} of {where}") for key in ("damping", "friction")]
+        far = 0.0 if is_urdf and kind != "continuous" else np.inf
+        ends = None if kind == "continuous" else limit
+        low, high = number("lower", ends, 0.0 - far), number("upper", ends, far)
+        rubs = number("damping", dynamics, 0.0), number("friction", dynamics, 0.0)
         length = float(np.linalg.norm(vector))
         if is_urdf and limit is None and kind != "continuous":
             fault = f"is {kind} and has no <limit>; give it lower and upper, or make it continuous or fixed"
-        elif ends[0] > ends[1]:
-            fault = f"has a lower limit of {ends[0]:g} above its upper one of {ends[1]:g}; exchange them"
+        elif low > high:
+            fault = f"has a lower limit of {low:g} above its upper one of {high:g}; exchange them"
         elif not length or min(rubs) < 0:
-            fault = f"has the axis {vector.tolist()} and the damping and friction {rubs}; 0 0 1, 0 and 0 would do"
+            fault = f"has the axis {vector.tolist()}, damping and friction {rubs}; 0 0 1, 0 and 0 would do"
         else:
             moves: Literal["prismatic", "revolute"] = "prismatic" if kind == "prismatic" else "revolute"
-            found = Joint(element.get("name", "?"), link, 0, moves, pose, turn @ vector / length, ends, *rubs)
+            found = Joint(name, link, 0, moves, pose, turn @ vector / length, (low, high), *rubs)
             self.frozen += _why_still(found)
             return None if _why_still(found) else found
         self.faults.append(f"{self.path}: {where} {fault}")
         return None
 
-    def _number(self, text: str | None, default: float, where: str) -> float:
-        value = float(numbers(text, 1, self.path, where, (default,))[0]) if text else default
-        return value if abs(value) < 1e16 else float(np.copysign(np.inf, value))  # of SDFormat
-
     def articulate(self, holding: Mapping[str, tuple[str, Joint | None]]) -> None:
         """Sort the joints and number the links, from the parent and the joint that hold each link."""
-        chains: dict[str, list[str]] = {}
-        for link in holding:
-            chain = [link]
-            while holding[chain[-1]][0] in holding and len(chain) <= len(holding):
-                chain.append(holding[chain[-1]][0])
-            chains[link] = chain
-        for link in sorted(holding, key=lambda link: len(chains[link])):
-            parent, joint = holding[link]
-            if joint is not None and len(chains[link]) <= len(holding):
-                self.joints.append(replace(joint, parent=self.rows.get(parent, 0)))
-                self.rows[link] = len(self.joints)
-            else:
-                self.frozen += [] if joint is None else [f"{joint.name} (in a loop)"]
+        left = dict(holding)
+        while ready := [link for link in left if left[link][0] not in left]:
+            for link in ready:
+                parent, joint = left.pop(link)
                 self.rows[link] = self.rows.get(parent, 0)
+                if joint is not None:
+                    self.joints.append(replace(joint, parent=self.rows[link]))
+                    self.rows[link] = len(self.joints)
+        self.frozen += [f"{joint.name} (in a loop)" for _, joint in left.values() if joint is not None]
 
     def add(self, link: Element, place: Callable[[Element, str], Array], materials: _Colors) -> list[Shape]:
         """Read the shapes of a link, whose poses in the model frame ``place`` gives; returns its collisions."""
@@ -523,23 +517,22 @@ def _hinges(
         parent = rows.get(int(model.body_parentid[body]), 0)
         rows[body] = 0 if body == root else parent
         own = [j for j in range(model.njnt) if model.jnt_bodyid[j] == body and model.jnt_type[j] != 0]
-        names = [model.joint(j).name or f"joint_{j}" for j in own]
-        if len(own) != 1 or body == root or model.jnt_type[own[0]] == 1 or own[0] in follows:
-            ball = "ball" if own and model.jnt_type[own[0]] == 1 else "several of a body"
-            why = "of the first body" if body == root else "mimic" if follows.intersection(own) else ball
-            frozen += [f"{name} ({why})" for name in names]
-            continue
-        (j,) = own
-        dof, zero = model.jnt_dofadr[j], model.qpos0[model.jnt_qposadr[j]]
-        limits = tuple((model.jnt_range[j] - zero).tolist()) if model.jnt_limited[j] else (-np.inf, np.inf)
-        pose, kind = base @ pose_of(data.xanchor[j], data.xmat[body].reshape(3, 3)), _KINDS[int(model.jnt_type[j])]
-        rubs = float(model.dof_damping[dof]), float(model.dof_frictionloss[dof])
-        link = model.body(body).name or f"body_{body}"
-        joint = Joint(names[0], link, parent, kind, pose, model.jnt_axis[j].astype(float), limits, *rubs)
-        frozen += _why_still(joint)
-        if not _why_still(joint):
-            joints.append(joint)
-            rows[body] = len(joints)
+        why = "of the first body" if body == root else "several of a body" if len(own) > 1 else ""
+        for j in own:
+            name = model.joint(j).name or f"joint_{j}"
+            if reason := "ball" if model.jnt_type[j] == 1 else "mimic" if j in follows else why:
+                frozen.append(f"{name} ({reason})")
+                continue
+            dof, zero = model.jnt_dofadr[j], model.qpos0[model.jnt_qposadr[j]]
+            limits = tuple((model.jnt_range[j] - zero).tolist()) if model.jnt_limited[j] else (-np.inf, np.inf)
+            pose, kind = base @ pose_of(data.xanchor[j], data.xmat[body].reshape(3, 3)), _KINDS[int(model.jnt_type[j])]
+            rubs = float(model.dof_damping[dof]), float(model.dof_frictionloss[dof])
+            link = model.body(body).name or f"body_{body}"
+            joint = Joint(name, link, parent, kind, pose, model.jnt_axis[j].astype(float), limits, *rubs)
+            frozen += _why_still(joint)
+            if not _why_still(joint):
+                joints.append(joint)
+                rows[body] = len(joints)
     return rows, tuple(joints), frozen
 
 
