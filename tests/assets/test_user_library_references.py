@@ -715,7 +715,8 @@ attached_to="j"/><link
 name="c"><pose relative_to="h"/><visual
 name="p"><geometry><plane/></geometry></visual></link><joint name="k" type="revolute"><pose>0 0 0 0.1 0
 0</pose><parent>a</parent><child>c</child><axis><xyz expressed_in="f">0 0 1</xyz><limit><lower>-1</lower>
-<upper>1</upper></limit><dynamics><damping>1</damping><friction>2</friction></dynamics></axis></joint><link name="d"/><joint name="l" type="revolute">
+<upper>1</upper></limit><dynamics><damping>1</damping><friction>2</friction></dynamics></axis></joint><link name="d"/><joint
+name="l" type="revolute">
 <pose>0 0 0 0.1 0 0</pose><parent>a</parent><child>d</child><axis><use_parent_model_frame>true</use_parent_model_frame>
 </axis></joint><link name="e"/><joint name="m" type="revolute"><parent>a</parent><child>e</child><axis>
 <mimic joint="k"/></axis></joint></model></world></sdf>""",

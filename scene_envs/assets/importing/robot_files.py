@@ -395,10 +395,26 @@ def read_urdf(path: Path) -> Model:
     holding = [j for j in robot.findall("joint") for parent in j.findall("parent") if parent.get("link") == "world"]
     if holding:  # a link that need not be declared
         links.setdefault("world", Element("link", name="world"))
-    poses, held_by = _link_poses(robot, links, path)
+    places: dict[str, tuple[str, Array]] = {}  # parent of a link, and its pose there
+    held_by: dict[str, Element] = {}
+    for joint in robot.findall("joint"):
+        name = joint.get("name", "?")
+        ends = [element.get("link", "") if (element := joint.find(t)) is not None else "" for t in ("parent", "child")]
+        for end in ends:
+            if end not in links:
+                raise CorruptFileError(f"{path}: joint {name!r} connects link {end!r}, which does not exist")
+        if ends[1] in places:
+            raise CorruptFileError(f"{path}: link {ends[1]!r} is the child of two joints; a URDF is a tree")
+        places[ends[1]], held_by[ends[1]] = (ends[0], _placed(path, np.eye(4), joint, f"joint {name!r}")), joint
+    roots = [name for name in links if name not in places]
+    if len(roots) != 1:
+        found = ", ".join(map(repr, roots)) or "none (its joints form a loop)"
+        raise CorruptFileError(f"{path}: a URDF has one root link, this one has {found}")
+    frames = _Frames(path, {roots[0]: ("", np.eye(4)), **places})
+    poses = {name: frames.pose(name) for name in links}
     still = np.eye(3)
-    held_with = {link: (parent, reading.joint(j, link, poses[link], still)) for link, (parent, j) in held_by.items()}
-    reading.rows, reading.joints, _ = _numbered(held_with)
+    moved = {link: (places[link][0], reading.joint(j, link, poses[link], still)) for link, j in held_by.items()}
+    reading.rows, reading.joints, _ = _numbered(moved)
     materials: dict[str, Color | None] = {}
     for material in [*robot.findall("material"), *robot.findall("link/visual/material")]:
         if material.find("color") is not None:  # it may be defined inside any visual
@@ -413,30 +429,6 @@ def read_urdf(path: Path) -> Model:
     massless = reading.inertials and all(inertial.mass == 0 for _, inertial in reading.inertials)
     held = _TO_WORLD if any(joint.get("type") not in ("floating", "planar") for joint in holding) else ""
     return reading.model("the file gives mass 0" if massless else held)
-
-
-def _link_poses(
-    robot: Element, links: dict[str, Element], path: Path
-) -> tuple[dict[str, Array], dict[str, tuple[str, Element]]]:
-    """(4, 4) of each link in the root link's frame, and the parent and the joint that hold a link."""
-    held_by: dict[str, tuple[str, Element]] = {}
-    places: dict[str, tuple[str, Array]] = {}
-    for joint in robot.findall("joint"):
-        name = joint.get("name", "?")
-        ends = [element.get("link", "") if (element := joint.find(t)) is not None else "" for t in ("parent", "child")]
-        for end in ends:
-            if end not in links:
-                raise CorruptFileError(f"{path}: joint {name!r} connects link {end!r}, which does not exist")
-        if ends[1] in places:
-            raise CorruptFileError(f"{path}: link {ends[1]!r} is the child of two joints; a URDF is a tree")
-        held_by[ends[1]] = ends[0], joint
-        places[ends[1]] = ends[0], _placed(path, np.eye(4), joint, f"joint {name!r}")
-    roots = [name for name in links if name not in places]
-    if len(roots) != 1:
-        found = ", ".join(map(repr, roots)) or "none (its joints form a loop)"
-        raise CorruptFileError(f"{path}: a URDF has one root link, this one has {found}")
-    frames = _Frames(path, {roots[0]: ("", np.eye(4)), **places})
-    return {name: frames.pose(name) for name in links}, held_by
 
 
 def _placed(path: Path, base: Array, element: Element, where: str) -> Array:
