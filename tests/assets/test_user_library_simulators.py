@@ -92,7 +92,7 @@ def test_a_cabinet_is_one_body_as_mujoco_weighs_it(tmp_path: Path) -> None:
     for words in (
         "movable joints frozen at zero: hinge",
         "'floor', a plane of body 'world', is left out",
-        "friction of",
+        "not read: geom/@friction",
     ):
         assert words in said(tmp_path)
     fixed = listed(tmp_path, "it.xml", CABINET.replace("<freejoint/>", ""))
@@ -308,10 +308,32 @@ def test_a_folder_leaves_out_what_an_mjcf_includes(tmp_path: Path) -> None:
     body = "<body><freejoint/><geom type='mesh' mesh='b'/></body>"
     head = "<compiler assetdir='assets'/><include file='parts/inc.xml'/>"
     (tmp_path / "cup.xml").write_text(f"<mujoco>{head}<worldbody>{body}</worldbody></mujoco>")
-    (tmp_path / "parts" / "inc.xml").write_text("<mujoco><asset><mesh file='b.stl'/></asset></mujoco>")
+    (tmp_path / "parts" / "inc.xml").write_text("<mujoco><include file='parts/more.xml'/></mujoco>")
+    (tmp_path / "parts" / "more.xml").write_text("<mujoco><asset><mesh file='b.stl'/></asset></mujoco>")
     (asset,) = load_library(tmp_path)
     assert asset.name == "cup"
     assert asset.mass == pytest.approx(1000 * 0.2 * 0.1 * 0.05)
+
+
+def test_a_model_that_another_attaches_is_no_asset_and_joins_its_mass(tmp_path: Path) -> None:
+    """By MuJoCo, which also strips the folders of its meshes."""
+    trimesh.creation.box((0.2, 0.1, 0.05)).export(tmp_path / "b.stl")
+    lid = "<asset><mesh file='far/b.stl'/></asset><worldbody><body name='x'><geom type='mesh' mesh='b'/></body></worldbody>"
+    (tmp_path / "lid.xml").write_text(f"<mujoco>{lid}</mujoco>")
+    body = "<freejoint/><geom type='box' size='.1 .1 .1'/><attach model='lid' body='x' prefix='p'/>"
+    asset = "<compiler strippath='true'/><asset><model name='lid' file='lid.xml'/></asset>"
+    (tmp_path / "cup.xml").write_text(f"<mujoco>{asset}<worldbody><body>{body}</body></worldbody></mujoco>")
+    (cup,) = load_library(tmp_path)
+    assert cup.name == "cup"
+    assert cup.mass == pytest.approx(1000 * (0.2**3 + 0.2 * 0.1 * 0.05))
+
+
+def test_drag_of_a_free_joint_and_masks_of_geoms_are_named(tmp_path: Path) -> None:
+    geom = "<geom type='box' size='.1 .1 .1' contype='4' conaffinity='2'/>"
+    head = "<mujoco><default><joint damping='1'/></default><worldbody><body><joint type='free' frictionloss='1'/>"
+    listed(tmp_path, "it.xml", f"{head}{geom}</body></worldbody></mujoco>")
+    for words in ("damping of the free joint", "frictionloss of the free joint", "contype and conaffinity above 1"):
+        assert words in said(tmp_path)
 
 
 def test_a_face_beyond_the_vertices_is_named(tmp_path: Path) -> None:

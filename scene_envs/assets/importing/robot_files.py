@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, fromstring
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -40,9 +40,8 @@ from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDepend
 _Colors = Mapping[str, Color | None]
 _ZERO = (0.0, 0.0, 0.0)
 _TO_WORLD = "a joint holds it at `world`"
-_LEFT_OUT = ("nu actuators", "nsensor sensors", "ntendon tendons", "neq constraints", "nflex flexes", "nskin skins",
-             "nplugin plugins", "ngravcomp gravcomp")  # fmt: skip
-"""The sizes of a model in MuJoCo that count what an asset does not have."""
+_OF_FREE = ("dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness")
+"""What MuJoCo gives a free joint and an asset does not have."""
 _NOT_OF_USD = ("kinematicEnabled", "velocity", "angularVelocity", "restitution")
 """Properties of UsdPhysics that an asset does not have."""
 
@@ -379,7 +378,7 @@ def read_mjcf(path: Path) -> Model:
     base = np.linalg.inv(pose_of(data.xpos[root], data.xmat[root].reshape(3, 3)))
     visuals: list[Shape] = []
     collisions: list[Shape] = []
-    notes = [] if model.ntex == 0 else [f"not read: {model.ntex} texture(s); what has one has the colour of the asset"]
+    notes = _unread(fromstring(spec.to_xml()), "MJCF")
     for geom in range(model.ngeom):
         name = f"geom {model.geom(geom).name or geom!r}"
         shape = _geom(model, geom, base @ pose_of(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)), path, name)
@@ -396,14 +395,15 @@ def read_mjcf(path: Path) -> Model:
         pose = base @ pose_of(data.xipos[body], data.ximat[body].reshape(3, 3))
         own = MassProperties(float(model.body_mass[body]), np.zeros(3), np.diag(model.body_inertia[body]))
         inertials.append(moved_inertial(pose, own))
-    counts = [(getattr(model, key), what) for key, what in map(str.split, _LEFT_OUT)]
-    notes += [f"not read: {count} {what}" for count, what in counts if count]
-    if (model.geom_friction[:, 0] != 1.0).any():
-        notes.append("not read: friction of geoms, because all objects of a scene have the same")
+    if ((model.geom_contype | model.geom_conaffinity) & ~1).any():
+        notes.append("not read: contype and conaffinity above 1, because all objects of a scene collide")
     free = [j for j in range(model.njnt) if model.jnt_type[j] == 0 and model.jnt_bodyid[j] == root]
     held = [j for j in range(model.njnt) if j not in free and model.jnt_bodyid[j] in bodies]
     if movable := [model.joint(j).name or f"joint {j}" for j in held]:
         notes.append(f"movable joints frozen at zero: {', '.join(movable)}")
+    notes += [
+        f"not read: {key[4:]} of the free joint" for key in _OF_FREE if free and getattr(model, key)[free[0]].any()
+    ]
     if not free:
         notes.append("it has no free joint: it is welded (`welded: false` makes it free)")
     return Model(tuple(visuals), tuple(collisions), tuple(inertials), None if free else True, tuple(notes))
