@@ -3,6 +3,7 @@ closed forms."""
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
 from itertools import product
@@ -13,10 +14,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from scene_envs.assets import Asset, import_report, load_library
-from scene_envs.assets.importing.mesh_files import FORMATS, Model, cut_polygons
+from scene_envs.assets.importing.mesh_files import FORMATS, Y_UP, Model, cut_polygons, read_mesh
 from scene_envs.assets.importing.robot_files import read_sdf, read_urdf
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from tests.helpers.model_files import BOX, POINTS, block, dae, gltf, triangles
@@ -117,14 +119,124 @@ def test_a_broken_look_of_a_dae_costs_no_geometry(tmp_path: Path, looks: str, ta
         assert np.unique(asset.visual.visual.vertex_colors[:, :3], axis=0).tolist() == [[230, 26, 26]]
 
 
-def test_a_skinned_mesh_is_named_and_other_meshes_are_read(tmp_path: Path) -> None:
+# -- skins ----------------------------------------------------------------------------------------
+
+
+def placed(angles: tuple[float, ...], place: tuple[float, ...]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", angles).as_matrix(), place
+    return pose
+
+
+FIRST, SECOND = placed((0.1, 0.2, 0.3), (0.5, 0, 0.2)), placed((0.7, 0, 0.2), (0, 0, 0.2))
+BINDS = [np.linalg.inv(placed((0, 0, 0.1), (0, 0, -0.2))), np.linalg.inv(placed((0.1, 0, 0), (0, 0.05, 0)))]
+ASIDE = placed((0.3, 0, 0), (3, 3, 3))  # pose of the node that holds the mesh, which a skin ignores
+SHAPE = placed((0.2, 0, 0), (0.01, 0, 0))
+ROD = trimesh.creation.box((0.2, 0.1, 0.4)).subdivide().subdivide()
+SHARE = np.clip(ROD.vertices[:, 2] / 0.4 + 0.5, 0, 1).astype("<f4")  # weight of the second joint
+
+
+def bent(shape: np.ndarray) -> trimesh.Trimesh:
+    """The rod in closed form: the mean of what each joint makes of it."""
+    moves = [joint @ bind @ shape for joint, bind in zip((FIRST, FIRST @ SECOND), BINDS, strict=True)]
+    first, second = (trimesh.transform_points(ROD.vertices, move) for move in moves)
+    return trimesh.Trimesh((1 - SHARE[:, None]) * first + SHARE[:, None] * second, ROD.faces, process=False)
+
+
+def skinned_gltf(form: str) -> bytes:
+    count = len(ROD.vertices)
+    weights = np.stack([1 - SHARE, SHARE, 0 * SHARE, 0 * SHARE], axis=1)
+    arrays = [
+        (ROD.vertices.astype("<f4"), 5126, "VEC3"), (ROD.faces.astype("<u2").reshape(-1), 5123, "SCALAR"),
+        (np.tile(np.array([0, 1, 0, 0], "u1"), (count, 1)), 5121, "VEC4"), (weights.astype("<f4"), 5126, "VEC4"),
+        (np.array([bind.T for bind in BINDS], "<f4"), 5126, "MAT4"),
+    ]  # fmt: skip
+    data, views, accessors = b"", [], []
+    for index, (array, kind, shape) in enumerate(arrays):
+        data += bytes(-len(data) % 4)
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
+        accessors.append({"bufferView": index, "componentType": kind, "count": len(array), "type": shape})
+        data += array.tobytes()
+    nodes = [{"mesh": 0, "skin": 0, "matrix": ASIDE.T.ravel().tolist()}, {"matrix": FIRST.T.ravel().tolist()}]
+    nodes[1]["children"], uri = [2], "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    primitive = {"attributes": {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}, "indices": 1}
+    header = {
+        "asset": {"version": "2.0"}, "buffers": [{"byteLength": len(data)} | ({"uri": uri} if form == "gltf" else {})],
+        "bufferViews": views, "accessors": accessors, "meshes": [{"name": "rod", "primitives": [primitive]}],
+        "skins": [{"joints": [1, 2], "inverseBindMatrices": 4}], "scenes": [{"nodes": [0, 1]}],
+        "nodes": [*nodes, {"matrix": SECOND.T.ravel().tolist()}],
+    }  # fmt: skip
+    text = json.dumps(header).encode()
+    text, data = text + b" " * (-len(text) % 4), data + bytes(-len(data) % 4)
+    head = struct.pack("<4s3I4s", b"glTF", 2, 28 + len(text) + len(data), len(text), b"JSON")
+    return text if form == "gltf" else head + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+
+
+def skinned_dae() -> str:
+    def row(values: Any) -> str:
+        return " ".join(map(repr, np.ravel(values).tolist()))
+
+    def source(name: str, kind: str, values: str, step: int, param: str) -> str:
+        count = len(values.split())
+        return (
+            f'<source id="{name}"><{kind}_array id="{name}a" count="{count}">{values}</{kind}_array><technique_common>'
+            f'<accessor source="#{name}a" count="{count // step}" stride="{step}"><param name="{param}" type="float"/>'
+            "</accessor></technique_common></source>"
+        )
+
+    count = len(ROD.vertices)
+    skin = f"""<library_controllers><controller id="k"><skin source="#g"><bind_shape_matrix>{row(SHAPE)}
+</bind_shape_matrix>{source("kj", "Name", "a b", 1, "JOINT")}{source("kb", "float", row(BINDS), 16, "TRANSFORM")}
+{source("kw", "float", row(np.stack([1 - SHARE, SHARE], axis=1)), 1, "WEIGHT")}<joints><input semantic="JOINT"
+source="#kj"/><input semantic="INV_BIND_MATRIX" source="#kb"/></joints><vertex_weights count="{count}"><input
+semantic="JOINT" source="#kj" offset="0"/><input semantic="WEIGHT" source="#kw" offset="1"/><vcount>{"2 " * count}
+</vcount><v>{" ".join(f"0 {2 * i} 1 {2 * i + 1}" for i in range(count))}</v></vertex_weights></skin></controller>
+</library_controllers>"""
+    nodes = f"""<matrix>{row(ASIDE)}</matrix><instance_controller url="#k"><skeleton>#a</skeleton></instance_controller>
+</node><node id="other"><node sid="a"/></node><node id="a" sid="a" type="JOINT"><matrix>{row(FIRST)}</matrix><node
+sid="b" type="JOINT"><matrix>{row(SECOND)}</matrix></node>"""
+    return dae(triangles(ROD), ROD.vertices.astype("<f4"), more=skin, node=nodes)
+
+
+@pytest.mark.parametrize(
+    ("form", "low", "high"),
+    [
+        ("gltf", [0.39507963, -0.23076328, 0.17537948], [0.74273872, 0.07163274, 0.55824341]),
+        ("glb", [0.39507963, -0.23076328, 0.17537948], [0.74273872, 0.07163274, 0.55824341]),
+        ("dae", [0.4007276, -0.24600523, 0.17066336], [0.75506969, 0.10769477, 0.53384486]),
+    ],
+)
+def test_a_skinned_mesh_is_where_its_joints_put_it(
+    tmp_path: Path, form: str, low: list[float], high: list[float]
+) -> None:
+    """As in closed form, and as the loaders of three.js 0.160 place it, whose bounds these are."""
     pytest.importorskip("collada")
-    skin = '<library_controllers><controller id="k"><skin source="#g"/></controller></library_controllers>'
-    nodes = '<instance_geometry url="#g"/><instance_controller url="#k"/>'
-    assert sizes(listed(tmp_path, "it.dae", dae(triangles(block()), block().vertices, more=skin, node=nodes))) == list(
-        BOX
-    )
-    assert "its skinned meshes are left out" in said(tmp_path)
+    path = tmp_path / f"it.{form}"
+    path.write_bytes(skinned_dae().encode() if form == "dae" else skinned_gltf(form))
+    (mesh,) = read_mesh(path)
+    expected = bent(SHAPE if form == "dae" else np.eye(4))
+    np.testing.assert_allclose(expected.bounds, [low, high], atol=1e-7)
+    turn = np.eye(3) if form == "dae" else Y_UP
+    gaps, _ = cKDTree(expected.vertices @ turn.T).query(mesh.vertices)
+    assert gaps.max() < 1e-6
+    asset = listed(tmp_path, path.name, path.read_bytes(), ", decomposition: convex")
+    assert asset.mass == pytest.approx(500 * expected.volume, rel=1e-5)
+    assert "not" not in said(tmp_path).partition("%")[0].replace("the file gives none", "")
+
+
+def test_what_a_skin_lacks_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("collada")
+    file = json.loads(skinned_gltf("gltf"))
+    (tmp_path / "it.gltf").write_text(json.dumps({**file, "scenes": [{"nodes": [0]}]}))
+    with pytest.raises(CorruptFileError, match=r"the nodes \[1, 2\], joints of a skin, are not in its scene"):
+        read_mesh(tmp_path / "it.gltf")
+    del file["meshes"][0]["primitives"][0]["attributes"]["JOINTS_0"]
+    (tmp_path / "it.gltf").write_text(json.dumps(file))
+    with pytest.raises(InvalidInputError, match="a skin without joints or weights"):
+        read_mesh(tmp_path / "it.gltf")
+    (tmp_path / "it.dae").write_text(skinned_dae().replace(">a b<", ">a c<"))
+    with pytest.raises(CorruptFileError, match="the joint 'c' of the skin 'k' is not in its scene"):
+        read_mesh(tmp_path / "it.dae")
 
 
 # -- polygons -------------------------------------------------------------------------------------
@@ -304,12 +416,11 @@ def test_what_a_gltf_holds_besides_its_geometry_is_named(tmp_path: Path) -> None
         block().faces,
         extensionsUsed=["KHR_texture_transform", "VENDOR_thing", "KHR_materials_unlit"],
         animations=[],
-        nodes=[{"mesh": 0, "skin": 0, "weights": [1.0]}],
-        skins=[],
+        nodes=[{"mesh": 0, "weights": [1.0]}],
         images=[{"uri": "lost.png"}],
     )
     text = said(tmp_path)
-    for name in ("KHR_texture_transform", "VENDOR_thing", "animations", "skins", "morph targets"):
+    for name in ("KHR_texture_transform", "VENDOR_thing", "animations", "morph targets"):
         assert f"its {name} is not applied" in text
     assert "its texture 'lost.png' is not there" in text
     assert "unlit" not in text

@@ -140,7 +140,7 @@ GLTF: dict[str, dict[str, Any]] = {  # the properties of glTF 2.0 and a value th
 }  # fmt: skip
 UNSEEN = {
     "names": "name extras",
-    "nothing refers to it": ":cameras :textures :samplers",
+    "nothing refers to it": ":cameras :textures :samplers :skins",
     "normals follow from triangles, and looks name second texture coordinates": "NORMAL TANGENT TEXCOORD_1",
     "a skin that nothing applies": "JOINTS_0 WEIGHTS_0",
     "morph targets at rest": "targets",

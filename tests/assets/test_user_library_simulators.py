@@ -318,8 +318,8 @@ def test_a_folder_leaves_out_what_an_mjcf_includes(tmp_path: Path) -> None:
 def test_a_model_that_another_attaches_is_no_asset_and_joins_its_mass(tmp_path: Path) -> None:
     """By MuJoCo, which also strips the folders of its meshes."""
     trimesh.creation.box((0.2, 0.1, 0.05)).export(tmp_path / "b.stl")
-    lid = "<asset><mesh file='far/b.stl'/></asset><worldbody><body name='x'><geom type='mesh' mesh='b'/></body></worldbody>"
-    (tmp_path / "lid.xml").write_text(f"<mujoco>{lid}</mujoco>")
+    part = "<worldbody><body name='x'><geom type='mesh' mesh='b'/></body></worldbody>"
+    (tmp_path / "lid.xml").write_text(f"<mujoco><asset><mesh file='far/b.stl'/></asset>{part}</mujoco>")
     body = "<freejoint/><geom type='box' size='.1 .1 .1'/><attach model='lid' body='x' prefix='p'/>"
     asset = "<compiler strippath='true'/><asset><model name='lid' file='lid.xml'/></asset>"
     (tmp_path / "cup.xml").write_text(f"<mujoco>{asset}<worldbody><body>{body}</body></worldbody></mujoco>")
