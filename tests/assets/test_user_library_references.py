@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.assets import Asset, import_report, load_library
 from scene_envs.assets.importing.mesh_files import FORMATS, Y_UP, Model, cut_polygons, read_mesh
-from scene_envs.assets.importing.robot_files import read_sdf, read_urdf
+from scene_envs.assets.importing.robot_files import read_sdf, read_urdf, read_usd
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from tests.helpers.model_files import BOX, POINTS, block, dae, gltf, triangles
 
@@ -222,6 +222,46 @@ def test_a_skinned_mesh_is_where_its_joints_put_it(
     asset = listed(tmp_path, path.name, path.read_bytes(), ", decomposition: convex")
     assert asset.mass == pytest.approx(500 * expected.volume, rel=1e-5)
     assert "not" not in said(tmp_path).partition("%")[0].replace("the file gives none", "")
+
+
+@pytest.mark.parametrize("is_instance", [False, True])
+def test_a_skinned_mesh_of_usd_is_where_its_joints_put_it(tmp_path: Path, is_instance: bool) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
+
+    def matrix(pose: np.ndarray) -> Any:
+        return Gf.Matrix4d(*pose.T.ravel().tolist())
+
+    path = tmp_path / "it.usda"
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    place = "/_rod" if is_instance else "/rod"
+    root, skeleton = UsdSkel.Root.Define(stage, place), UsdSkel.Skeleton.Define(stage, f"{place}/bones")
+    root.GetPrim().SetSpecifier(Sdf.SpecifierClass if is_instance else Sdf.SpecifierDef)
+    skeleton.CreateJointsAttr(["a", "a/b"])
+    skeleton.CreateBindTransformsAttr([matrix(np.linalg.inv(bind)) for bind in BINDS])
+    skeleton.CreateRestTransformsAttr([matrix(FIRST), matrix(SECOND)])
+    mesh = UsdGeom.Mesh.Define(stage, f"{place}/mesh")
+    mesh.AddTransformOp().Set(matrix(ASIDE))
+    mesh.CreatePointsAttr(ROD.vertices.tolist())
+    mesh.CreateFaceVertexCountsAttr([3] * len(ROD.faces))
+    mesh.CreateFaceVertexIndicesAttr(ROD.faces.ravel().tolist())
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    binding.CreateGeomBindTransformAttr(matrix(SHAPE))
+    binding.CreateJointIndicesPrimvar(False, 2).Set([0, 1] * len(ROD.vertices))
+    binding.CreateJointWeightsPrimvar(False, 2).Set(np.stack([1 - SHARE, SHARE], axis=1).ravel().tolist())
+    if is_instance:
+        prim = stage.DefinePrim("/rod")
+        prim.GetReferences().AddInternalReference(place)
+        prim.SetInstanceable(True)
+    stage.Save()
+    (shape,) = read_usd(path).visuals
+    expected = bent(SHAPE)
+    np.testing.assert_allclose(shape.surface.vertices, expected.vertices, atol=1e-6)
+    asset = listed(tmp_path, "it.usda", path.read_text(), ", decomposition: convex, mass: 2")
+    np.testing.assert_allclose(asset.inertia, expected.moment_inertia * (2 / expected.volume), rtol=1e-4, atol=1e-7)
 
 
 def test_what_a_skin_lacks_is_named(tmp_path: Path) -> None:

@@ -38,8 +38,8 @@ def outcome(path: Path) -> tuple[Any, ...] | str:
     look = asset.visual
     return (
         asset.mass, asset.center_of_mass.tobytes(), asset.inertia.tobytes(), asset.static, look.vertices.tobytes(),
-        look.visual.vertex_colors.tobytes(), [part.vertices.tobytes() for part in asset.fine], report.origin,
-        report.notes + report.warnings,
+        look.faces.tobytes(), look.visual.vertex_colors.tobytes(), [part.vertices.tobytes() for part in asset.fine],
+        report.origin, report.notes + report.warnings,
     )  # fmt: skip
 
 
@@ -287,6 +287,56 @@ def test_each_shape_of_usd_is_read_or_named_or_refused(tmp_path: Path) -> None:
         said = found if isinstance(found, str) else " ".join(found[-1])
         kept += [name] if "/second" not in said else []
     assert sorted(kept) == ["Capsule", "Cube", "Cylinder", "Sphere"]
+
+
+USD_SHAPES: dict[str, dict[str, Any]] = {
+    "Cube": {"size": 0.3}, "Sphere": {"radius": 0.3}, "Cylinder": {"radius": 0.3, "height": 0.5, "axis": "X"},
+    "Capsule": {"radius": 0.3, "height": 0.5, "axis": "X"},
+    "Mesh": {"points": (2 * block().vertices).tolist(), "faceVertexCounts": [4, 4] + [3] * 8, "holeIndices": [0],
+             "faceVertexIndices": block().faces[::-1].ravel().tolist(), "orientation": "leftHanded",
+             "subdivisionScheme": "loop"},
+}  # fmt: skip
+USD_GPRIM = {
+    "visibility": "invisible", "purpose": "guide", "primvars:displayColor": [(1, 0, 0)], "orientation": "rightHanded"
+}  # fmt: skip
+USD_UNSEEN = {
+    "pictures are of closed bodies in one opaque colour, with normals of their own": "doubleSided normals "
+    "primvars:displayOpacity",
+    "they follow from the points": "extent velocities accelerations",
+    "where nothing is subdivided": "cornerIndices cornerSharpnesses creaseIndices creaseLengths creaseSharpnesses "
+    "interpolateBoundary faceVaryingLinearInterpolation triangleSubdivisionRule",
+    "of programs": "proxyPrim xformOpOrder",
+}
+
+
+@pytest.mark.parametrize("kind", USD_SHAPES)
+def test_each_attribute_of_the_shapes_of_usd(tmp_path: Path, kind: str) -> None:
+    """At time 0: a value that is only known over time counts as well. A primitive has no orientation."""
+    pytest.importorskip("pxr")
+    from pxr import Sdf, Usd, UsdGeom
+
+    changed: dict[str, Path] = {}
+    for name in ("", *Usd.SchemaRegistry().FindConcretePrimDefinition(kind).GetPropertyNames()):
+        if name in " ".join(USD_UNSEEN.values()).split():
+            continue
+        changed[name] = tmp_path / f"it_{name.replace(':', '_')}.usda"
+        stage = Usd.Stage.CreateNew(str(changed[name]))
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+        UsdGeom.Cube.Define(stage, "/other").AddTranslateOp().Set((0, 0, 3))
+        prim = stage.DefinePrim("/it", kind)
+        if kind == "Mesh":
+            for key, values in (("points", block().vertices), ("faceVertexIndices", block().faces.ravel())):
+                prim.GetAttribute(key).Set(values.tolist())
+            prim.GetAttribute("faceVertexCounts").Set([3] * 12)
+        if name:
+            attribute = prim.GetAttribute(name)
+            attribute.Clear()
+            when = [] if attribute.GetVariability() == Sdf.VariabilityUniform else [4.0]
+            attribute.Set({**USD_GPRIM, **USD_SHAPES[kind]}[name], *when)
+        stage.Save()
+    expected = changed.pop("")
+    assert silent(expected, changed) == ({"orientation"} if kind != "Mesh" else set())
 
 
 # -- MJCF -----------------------------------------------------------------------------------------

@@ -221,6 +221,31 @@ def test_a_file_that_mujoco_wrote_is_read(tmp_path: Path) -> None:
     assert asset.mass == pytest.approx(500 * 8)
 
 
+def test_colours_of_usd_come_by_index_and_from_above_and_those_of_parts_are_named(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Sdf, Usd, UsdGeom
+
+    stage = Usd.Stage.CreateNew(str(tmp_path / "it.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    above = UsdGeom.PrimvarsAPI(UsdGeom.Xform.Define(stage, "/a"))
+    above.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, "constant").Set([(0, 1, 0)])
+    meshes = [UsdGeom.Mesh.Define(stage, f"/a/{name}") for name in "mno"]
+    for index, mesh in enumerate(meshes):
+        mesh.CreatePointsAttr((trimesh.creation.box((0.1, 0.1, 0.1)).vertices + (index, 0, 0)).tolist())
+        mesh.CreateFaceVertexCountsAttr([3] * 12)
+        mesh.CreateFaceVertexIndicesAttr(trimesh.creation.box().faces.ravel().tolist())
+    own = meshes[0].CreateDisplayColorPrimvar("uniform")
+    own.Set([(1, 0, 0), (0, 0, 1)])
+    own.SetIndices([0, 0, 0, *[1] * 9])
+    UsdGeom.Subset.CreateGeomSubset(meshes[1], "half", "face", [0, 1], "materialBind")
+    stage.Save()
+    asset = listed(tmp_path, "it.usda")
+    counts = dict(zip(*np.unique(asset.visual.visual.face_colors @ [1, 2, 4, 0], return_counts=True), strict=True))
+    assert counts == {255: 3, 4 * 255: 9, 2 * 255: 24}
+    assert "not read: materials of parts of /a/n" in said(tmp_path)
+
+
 def test_colours_of_faces_and_a_left_handed_mirrored_mesh(tmp_path: Path) -> None:
     """USD keeps linear colours: 0.2159 is 128 of 255 in sRGB. Faces of a mirror face outward again."""
     pytest.importorskip("pxr")

@@ -464,14 +464,19 @@ def read_usd(path: Path) -> Model:
     bodies that no joint connects, or shapes that are sheared.
     """
     stage = open_stage(path)
-    from pxr import Usd, UsdGeom, UsdPhysics
+    from pxr import Gf, UsdGeom, UsdPhysics, UsdSkel
 
     if lost := [" ".join(str(error).split()) for error in stage.GetCompositionErrors()]:
         raise CorruptFileError(f"{path} refers to what cannot be loaded: {lost[0][:300]}")
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         raise InvalidInputError(f"{path} does not state `metersPerUnit`; set it, 1 for metres or 0.01 for centimetres")
     reading = _Stage(path, stage)
-    prims = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.IsActive()]
+    stage.SetEditTarget(stage.GetSessionLayer())
+    while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
+        for prim in instances:
+            prim.SetInstanceable(False)
+    UsdSkel.BakeSkinning(stage.Traverse(), Gf.Interval(0.0))
+    prims = list(stage.Traverse())
     found = [prim for prim in prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
     bodies = [prim for prim in found if UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get()]
     joints = [UsdPhysics.Joint(prim) for prim in prims if prim.IsA(UsdPhysics.Joint)]
@@ -526,7 +531,7 @@ class _Stage:
         owner = next((p for p in _and_above(prim) if p.HasAPI(UsdPhysics.CollisionAPI)), None)
         collides = owner is not None and UsdPhysics.CollisionAPI(owner).GetCollisionEnabledAttr().Get() is not False
         image = UsdGeom.Imageable(prim)
-        drawn = image.ComputePurpose() in ("default", "render") and image.ComputeVisibility() != "invisible"
+        drawn = image.ComputePurpose() in ("default", "render") and image.ComputeVisibility(0.0) != "invisible"
         shape = self._mesh(prim, owner) if prim.IsA(UsdGeom.Mesh) else self._primitive(prim)
         if shape is None:
             self.notes.append(f"{prim.GetPath()} is a {prim.GetTypeName()}, which is left out")
@@ -537,14 +542,19 @@ class _Stage:
     def _mesh(self, prim: Any, owner: Any) -> Shape:
         """A mesh, a hull where its collider (of ``owner``) is one."""
         import trimesh
+        from pxr import UsdShade
 
         where, colors, (matrix, place) = str(prim.GetPath()), self._colors(prim), self._matrix(prim)
         names = ("points", "faceVertexIndices", "faceVertexCounts")
-        found, corners, counts = (np.array(prim.GetAttribute(name).Get() or ()) for name in names)
+        found, corners, counts = (np.array(prim.GetAttribute(name).Get(0.0) or ()) for name in names)
         corners, counts, points = corners.astype(int), counts.astype(int), found.reshape(-1, 3).astype(float)
         if counts.sum() != len(corners) or not len(corners) or not 0 <= corners.min() <= corners.max() < len(points):
             raise CorruptFileError(f"{self.path}: the faces of {where} do not fit to its points")
-        self.notes += [f"{where}: its holes are filled"] if prim.GetAttribute("holeIndices").Get() else []
+        self.notes += [f"{where}: its holes are filled"] if prim.GetAttribute("holeIndices").Get(0.0) else []
+        smooth = prim.GetAttribute("subdivisionScheme")
+        self.notes += [f"{where}: it is not subdivided"] * (smooth.HasAuthoredValue() and smooth.Get() != "none")
+        parts = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
+        self.notes += [f"not read: materials of parts of {where}"] if parts else []
         cut, polygons = cut_polygons(points, corners, counts)
         check_triangles(self.path, len(cut))
         inside_out = (prim.GetAttribute("orientation").Get() == "leftHanded") != (np.linalg.det(matrix) < 0)
@@ -584,7 +594,8 @@ class _Stage:
         """(N, 3) in 0..255 from the linear colours of a prim, N 0 without any."""
         from pxr import UsdGeom, UsdShade
 
-        values = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get() or ()
+        own = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
+        values = own.ComputeFlattened(0.0) or ()
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
         for shader in material.GetPrim().GetChildren() if material else ():
             diffuse = shader.GetAttribute("inputs:diffuseColor")
@@ -636,7 +647,7 @@ def _one(colors: Any) -> Color | None:
 
 def _number(prim: Any, name: str) -> float:
     """A number of a prim; 0 where it has none."""
-    return float((prim.GetAttribute(name).Get() if prim and prim.HasAttribute(name) else None) or 0.0)
+    return float((prim.GetAttribute(name).Get(0.0) if prim and prim.HasAttribute(name) else None) or 0.0)
 
 
 def _and_above(prim: Any) -> list[Any]:
