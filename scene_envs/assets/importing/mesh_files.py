@@ -22,7 +22,6 @@ from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
 from scene_envs.assets.importing.limits import check_file, check_triangles, gltf_header, seconds_left
@@ -94,11 +93,6 @@ def pose_of(translation: Array, rotation: Array) -> Array:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, translation
     return pose
-
-
-def from_roll_pitch_yaw(angles: Array) -> Array:
-    """(3, 3) rotation of URDF and SDF: about the fixed axes x, then y, then z; (3,) rad."""
-    return np.asarray(Rotation.from_euler("xyz", angles).as_matrix())
 
 
 def moved_inertial(pose: Array, inertial: MassProperties) -> MassProperties:
@@ -364,8 +358,7 @@ def _pose_dae(load: Any, *args: Any, **kwargs: Any) -> Any:
     from collada import scene
     from collada.controller import Skin
 
-    document = load(*args, **kwargs)
-    tag, places, skinned = document.tag, {}, []
+    document, places, skinned = load(*args, **kwargs), {}, []
 
     def visit(children: list[Any], base: Array, above: tuple[str, ...]) -> None:
         for node in [*children]:
@@ -384,7 +377,7 @@ def _pose_dae(load: Any, *args: Any, **kwargs: Any) -> Any:
     visit(document.scene.nodes, np.eye(4), ("",))
     for node in skinned:
         skin, matrices = node.controller, [node.controller.bind_shape_matrix]
-        roots = [(element.text or "").strip()[1:] for element in node.xmlnode.findall(tag("skeleton"))]
+        roots = [(element.text or "").strip()[1:] for element in node.xmlnode.findall(document.tag("skeleton"))]
         for joint in skin.weight_joints:
             found = [places[root, joint] for root in (*roots, "") if (root, joint) in places]
             if not found:
@@ -559,13 +552,13 @@ def _pose_gltf(parts: dict[str, Any], skins: list[list[int]]) -> None:
     for edge in parts["graph"]:  # the parents of a frame come before it
         frames[edge["frame_to"]] = frames[edge["frame_from"]] @ edge["matrix"]
         nodes[edge.get("metadata", {}).get("index")] = frames[edge["frame_to"]]
-    for edge in [
-        edge for edge in parts["graph"] if skins and "geometry" in edge and edge["metadata"]["skin"] is not None
-    ]:
-        skin, name = edge["metadata"]["skin"], edge.pop("geometry")
+    for edge in [edge for edge in parts["graph"] if skins and "geometry" in edge]:
+        if (skin := edge["metadata"]["skin"]) is None:
+            continue
         if lost := {*skins[skin]} - {*nodes}:
             raise ValueError(f"the nodes {sorted(lost)}, joints of a skin, are not in its scene")
-        mesh = {**parts["geometry"][name], "vertex_normals": None}
+        old = edge.pop("geometry")
+        mesh, new = {**parts["geometry"][old], "vertex_normals": None}, f"{old}_at the joints of {edge['frame_to']}"
         given = mesh.pop("vertex_attributes")
         joints, weights = (
             np.concatenate([given[key] for key in sorted(given) if key.startswith(kind)], axis=1)
@@ -575,11 +568,8 @@ def _pose_gltf(parts: dict[str, Any], skins: list[list[int]]) -> None:
         matrices = np.array([nodes[joint] for joint in skins[skin]]) @ binds
         rows = np.repeat(np.arange(len(joints)), joints.shape[1])
         mesh["vertices"] = _skinned(mesh["vertices"], rows, joints.ravel(), weights.ravel(), matrices)
-        edge = {"frame_from": base, "frame_to": f"{edge['frame_to']}_", "matrix": np.eye(4), "geometry": f"{name}_"}
-        while edge["geometry"] in parts["geometry"]:
-            edge["geometry"] += "_"
-        parts["geometry"][edge["geometry"]] = mesh
-        parts["graph"].append(edge)
+        parts["geometry"][new] = mesh
+        parts["graph"].append({"frame_from": base, "frame_to": new, "matrix": np.eye(4), "geometry": new})
 
 
 _PREPARED = {

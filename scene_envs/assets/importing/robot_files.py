@@ -24,7 +24,6 @@ from scene_envs.assets.importing.mesh_files import (
     color_of,
     cut_polygons,
     find_mesh,
-    from_roll_pitch_yaw,
     heavier,
     merged_inertial,
     moved_inertial,
@@ -216,8 +215,8 @@ def _pose(element: Element | None, path: Path, where: str) -> Array:
         values = numbers(element.text, 7, path, f"pose of {where}", (0.0,) * 6 + (1.0,))
         return pose_of(values[:3], _from_quaternion(values[3:], path, where))
     values = numbers(element.text, 6, path, f"pose of {where}", (0.0,) * 6)
-    angles = np.radians(values[3:]) if _flag(element.get("degrees")) else values[3:]
-    return pose_of(values[:3], from_roll_pitch_yaw(angles))
+    turn = Rotation.from_euler("xyz", values[3:], degrees=_flag(element.get("degrees")))
+    return pose_of(values[:3], turn.as_matrix())
 
 
 def _from_quaternion(quaternion: Array, path: Path, where: str) -> Array:
@@ -353,7 +352,7 @@ def _placed(path: Path, base: Array, element: Element, where: str) -> Array:
         quaternion = numbers(origin.get("quat_xyzw"), 4, path, f"origin quat_xyzw of {where}")
         return base @ pose_of(xyz, _from_quaternion(quaternion, path, where))
     rpy = numbers(origin.get("rpy"), 3, path, f"origin rpy of {where}", _ZERO)
-    return base @ pose_of(xyz, from_roll_pitch_yaw(rpy))
+    return base @ pose_of(xyz, Rotation.from_euler("xyz", rpy).as_matrix())
 
 
 def read_mjcf(path: Path) -> Model:
