@@ -232,7 +232,7 @@ def test_colours_of_usd_come_by_index_and_from_above_and_those_of_parts_are_name
     above.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, "constant").Set([(0, 1, 0)])
     meshes = [UsdGeom.Mesh.Define(stage, f"/a/{name}") for name in "mno"]
     for index, mesh in enumerate(meshes):
-        mesh.CreatePointsAttr((trimesh.creation.box((0.1, 0.1, 0.1)).vertices + (index, 0, 0)).tolist())
+        mesh.CreatePointsAttr((trimesh.creation.box((0.1, 0.1, 0.1)).vertices + np.array([index, 0, 0])).tolist())
         mesh.CreateFaceVertexCountsAttr([3] * 12)
         mesh.CreateFaceVertexIndicesAttr(trimesh.creation.box().faces.ravel().tolist())
     own = meshes[0].CreateDisplayColorPrimvar("uniform")
