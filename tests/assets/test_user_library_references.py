@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import struct
 from itertools import product
 from pathlib import Path
@@ -264,6 +265,44 @@ def test_a_skinned_mesh_of_usd_is_where_its_joints_put_it(tmp_path: Path, is_ins
     np.testing.assert_allclose(asset.inertia, expected.moment_inertia * (2 / expected.volume), rtol=1e-4, atol=1e-7)
 
 
+def test_skins_of_other_notations_are_the_same(tmp_path: Path) -> None:
+    """Two sets of influences, whose weights then add up to 2, and joints by id."""
+    pytest.importorskip("collada")
+    expected = bent(np.eye(4)).vertices @ Y_UP.T
+    file = json.loads(skinned_gltf("gltf"))
+    attributes = file["meshes"][0]["primitives"][0]["attributes"]
+    attributes |= {"JOINTS_1": attributes["JOINTS_0"], "WEIGHTS_1": attributes["WEIGHTS_0"]}
+    (tmp_path / "it.gltf").write_text(json.dumps(file))
+    np.testing.assert_allclose(read_mesh(tmp_path / "it.gltf")[0].vertices, expected, atol=1e-6)
+    plain, found = skinned_dae(), []
+    ids = plain.replace("Name_array", "IDREF_array").replace(">a b<", ">a n2<")
+    for text in (plain, ids.replace('<node\nsid="b"', '<node id="n2" sid="c"')):
+        assert text == plain or "n2" in text.partition("<library_visual")[2]
+        (tmp_path / "it.dae").write_text(text)
+        found.append(read_mesh(tmp_path / "it.dae")[0].vertices)
+    np.testing.assert_array_equal(*found)
+
+
+def test_a_corner_without_a_joint_keeps_its_bind_shape_and_morphs_are_named(tmp_path: Path) -> None:
+    pytest.importorskip("collada")
+    text = re.sub(r"<v>.*</v>", lambda match: match[0].replace("0 ", "-1 ", 1), skinned_dae())
+    (tmp_path / "it.dae").write_text(text)  # -1 is the bind shape: the first corner has all its weight there
+    first = SHARE[0] * trimesh.transform_points(ROD.vertices[:1], FIRST @ SECOND @ BINDS[1] @ SHAPE)
+    first += (1 - SHARE[0]) * trimesh.transform_points(ROD.vertices[:1], SHAPE)
+    assert cKDTree(read_mesh(tmp_path / "it.dae")[0].vertices).query(first)[0][0] < 1e-6
+    sources = """<source id="mt"><IDREF_array id="mta" count="1">g</IDREF_array><technique_common><accessor
+source="#mta" count="1"><param name="MORPH_TARGET" type="IDREF"/></accessor></technique_common></source><source id="mw"><float_array
+id="mwa" count="1">0</float_array><technique_common><accessor source="#mwa" count="1"><param name="MORPH_WEIGHT"
+type="float"/></accessor></technique_common></source>"""
+    targets = '<input semantic="MORPH_TARGET" source="#mt"/><input semantic="MORPH_WEIGHT" source="#mw"/>'
+    morph = f'<morph source="#g">{sources}<targets>{targets}</targets></morph>'
+    more = f'<library_controllers><controller id="k">{morph}</controller></library_controllers>'
+    node = '<instance_controller url="#k"/>'
+    asset = listed(tmp_path, "it.dae", dae(triangles(block()), block().vertices, more=more, node=node))
+    assert sizes(asset) == list(BOX)
+    assert "its morph targets are not applied" in said(tmp_path)
+
+
 def test_what_a_skin_lacks_is_named(tmp_path: Path) -> None:
     pytest.importorskip("collada")
     file = json.loads(skinned_gltf("gltf"))
@@ -464,6 +503,62 @@ def test_what_a_gltf_holds_besides_its_geometry_is_named(tmp_path: Path) -> None
         assert f"its {name} is not applied" in text
     assert "its texture 'lost.png' is not there" in text
     assert "unlit" not in text
+
+
+# -- PLY, OFF, STL --------------------------------------------------------------------------------
+
+CORNERS = "\n".join(" ".join(map(str, row)) for row in block().vertices.tolist())
+FACES = "\n".join(f"3 {a} {b} {c}" for a, b, c in block().faces.tolist())
+
+
+def ply(element: str = "", rows: str = "", comment: str = "") -> str:
+    head = "".join(f"property float {axis}\n" for axis in "xyz")
+    faces = "element face 12\nproperty list uchar int vertex_indices\n"
+    head = f"ply\nformat ascii 1.0\n{comment}element vertex 8\n{head}{faces}{element}end_header"
+    return f"{head}\n{CORNERS}\n{FACES}\n{rows}"
+
+
+def off(kind: str, corner: str = "", face: str = "") -> str:
+    corners, faces = (text.replace("\n", f"{more}\n") + more for text, more in ((CORNERS, corner), (FACES, face)))
+    return f"{kind}OFF\n8 12 0\n{corners}\n{faces}\n"
+
+
+def stl(head: bytes = b"", behind: bytes = bytes(2)) -> bytes:
+    data = bytearray(block().export(file_type="stl"))
+    data[: len(head)] = head
+    data[84 + 48 : 84 + 50] = behind
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("it.ply", ply(), ""),
+        ("it.ply", ply("element tristrips 1\nproperty list int int vertex_indices\n", "3 0 1 2\n"), "'tristrips'"),
+        ("it.ply", ply("element edge 1\nproperty int vertex1\nproperty int vertex2\n", "0 1\n"), "'edge' are left"),
+        ("it.ply", ply(comment="comment TextureFile lost.png\n"), "its texture 'lost.png' is not there"),
+        ("it.off", off(""), ""),
+        ("it.off", off("C", " 255 0 0 255"), "its colours, normals and texture coordinates are not read"),
+        ("it.off", off("N", " 0 0 1"), "its colours, normals and texture coordinates are not read"),
+        ("it.off", off("", "", " 255 0 0"), "its colours, normals and texture coordinates are not read"),
+        ("it.stl", stl(), ""),
+        ("it.stl", stl(b"COLOR=\xff\x00\x00\xff"), "its colours are not read"),
+        ("it.stl", stl(behind=b"\x1f\x80"), "its colours are not read"),
+    ],
+)  # fmt: skip
+def test_what_a_simple_mesh_file_holds_besides_its_triangles_is_named(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, text: str | bytes, words: str
+) -> None:
+    asset = listed(tmp_path, name, text)
+    assert asset.mass == pytest.approx(500 * 0.2 * 0.1 * 0.04)
+    assert words in said(tmp_path)
+    assert words or "not" not in said(tmp_path).partition("%")[0]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_points_of_four_dimensions_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"it\.off is a 4OFF"):
+        listed(tmp_path, "it.off", off("4", " 1"))
 
 
 # -- closed bodies --------------------------------------------------------------------------------

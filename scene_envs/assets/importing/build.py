@@ -416,17 +416,8 @@ def _upright(up: Axis) -> Array:
 
 def _diagonal(shapes: Sequence[Shape]) -> float:
     """Length (m) of the diagonal of the bounding box of all shapes."""
-    points = []
-    for shape in shapes:
-        if shape.kind == "mesh":
-            points += [np.asarray(mesh.vertices) for mesh in meshes_of(shape)]
-        else:
-            reach = sum(shape.size) if shape.kind == "capsule" else max(shape.size)
-            half = np.array(shape.size) / 2 if shape.kind == "box" else np.full(3, reach)
-            corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
-            points.append(corners @ shape.pose[:3, :3].T + shape.pose[:3, 3])
-    cloud = np.concatenate(points)
-    return float(np.linalg.norm(cloud.max(axis=0) - cloud.min(axis=0)))
+    meshes = [mesh for s in shapes for mesh in (meshes_of(s) if s.kind == "mesh" else visual_of(s, None))]
+    return float(np.linalg.norm(np.ptp(np.concatenate([mesh.bounds for mesh in meshes]), axis=0)))
 
 
 def _collide(

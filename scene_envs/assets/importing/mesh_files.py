@@ -160,7 +160,7 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     if len(pieces) < len(found):
         content.notes.append(f"{len(found) - len(pieces)} object(s) of points or lines left out")
     if not pieces:
-        raise CorruptFileError(f"{path} holds no triangles")
+        raise CorruptFileError("; ".join([f"{path} holds no triangles", *dict.fromkeys(content.notes)]))
     for mesh in pieces:
         _check_mesh(mesh, path)
     check_triangles(path, sum(len(mesh.faces) for mesh in pieces))
@@ -287,6 +287,7 @@ def _prepare_obj(content: _Content) -> None:
     for library in [content.path.parent / name for name in libraries[:1]]:
         materials = decode_text(library.read_bytes()) if library.is_file() else ""
         content.expect(re.findall(r"^\s*map_Kd\s+(.+?)\s*$", materials, re.MULTILINE | re.IGNORECASE), "texture")
+    content.notes += [f"its file {name!r} is not read" for name in re.findall(r"^call (\S+)", text, re.MULTILINE)]
     if re.search(r"^(?:l|p|curv2?|surf) ", text, re.MULTILINE):
         content.notes.append("its points, lines and curves are left out")
     if re.search(r"^f(?: +[^\s#]+){4}|^f[^\n]*[ /]-", text, re.MULTILINE):
@@ -356,7 +357,6 @@ def _triangleset(polygons: Any) -> Any:
 def _pose_dae(load: Any, *args: Any, **kwargs: Any) -> Any:
     """A COLLADA document whose skinned meshes have the shape that their joints give them; ``load`` reads it."""
     from collada import scene
-    from collada.controller import Skin
 
     document, places, skinned = load(*args, **kwargs), {}, []
 
@@ -364,7 +364,7 @@ def _pose_dae(load: Any, *args: Any, **kwargs: Any) -> Any:
         for node in [*children]:
             if isinstance(node, scene.ControllerNode):
                 children.remove(node)
-                if isinstance(node.controller, Skin):
+                if hasattr(node.controller, "joint_matrices"):
                     skinned.append(node)
                 else:
                     children.append(scene.GeometryNode(node.controller.source_geometry, node.materials))
@@ -425,17 +425,40 @@ def _drop_looks(content: _Content, error: Exception) -> bool:
 
 
 def _prepare_off(content: _Content) -> None:
-    """The same mesh as an OBJ."""
+    """The same mesh as an OBJ; InvalidInputError for points of other dimensions than three."""
     from trimesh.util import comment_strip, decode_text
 
-    lines = comment_strip(decode_text(content.data)).split("OFF", 1)[-1].split("\n")
-    rows = [line.split() for line in lines if line.strip()]
+    kind, _, text = comment_strip(decode_text(content.data)).rpartition("OFF")
+    if {"4", "n"} & {*kind}:
+        raise InvalidInputError(
+            f"{content.path} is a {kind.strip()}OFF, whose points are not in space; export it as OFF"
+        )
+    rows = [line.split() for line in text.split("\n") if line.strip()]
     vertices, faces = int(rows[0][0]), int(rows[0][1])
-    text = ["v " + " ".join(row[:3]) for row in rows[1 : vertices + 1]]
-    for row in rows[vertices + 1 : vertices + faces + 1]:
-        text.append("f " + " ".join(str(int(word) + 1) for word in row[1 : int(row[0]) + 1]))
-    content.type, content.data = "obj", "\n".join(text).encode()
+    points, polygons = rows[1 : vertices + 1], rows[vertices + 1 : vertices + faces + 1]
+    lines = ["v " + " ".join(row[:3]) for row in points]
+    lines += ["f " + " ".join(str(int(word) + 1) for word in row[1 : int(row[0]) + 1]) for row in polygons]
+    if any(len(row) > 3 for row in points) or any(len(row) > int(row[0]) + 1 for row in polygons):
+        content.notes.append("its colours, normals and texture coordinates are not read")
+    content.type, content.data = "obj", "\n".join(lines).encode()
     _prepare_obj(content)
+
+
+def _prepare_stl(content: _Content) -> None:
+    """Colours are not loaded: some programs write them into the header or behind each triangle."""
+    if len(content.data) == 84 + 50 * int.from_bytes(content.data[80:84], "little"):  # a binary one
+        rows = np.frombuffer(content.data[84:], np.uint8).reshape(-1, 50)
+        content.notes += ["its colours are not read"] * bool(rows[:, 48:].any() or b"COLOR=" in content.data[:80])
+
+
+def _prepare_ply(content: _Content) -> None:
+    """What is not loaded: elements besides vertices and faces, and textures that are not there."""
+    head = content.data.partition(b"end_header")[0].decode("ascii", "replace")
+    content.expect(re.findall(r"^comment TextureFile (.+?)\s*$", head, re.MULTILINE), "texture")
+    if content.notes:
+        content.data = content.data.replace(b"TextureFile", b"texture")
+    names = re.findall(r"^element\s+(?!vertex\s|face\s)(\w+)", head, re.MULTILINE)
+    content.notes += [f"its elements {name!r} are left out" for name in names]
 
 
 def _cut_again(mesh: Any) -> None:
@@ -573,7 +596,8 @@ def _pose_gltf(parts: dict[str, Any], skins: list[list[int]]) -> None:
 
 
 _PREPARED = {
-    ".obj": _prepare_obj, ".off": _prepare_off, ".dae": _prepare_dae, ".glb": _prepare_gltf, ".gltf": _prepare_gltf
+    ".obj": _prepare_obj, ".off": _prepare_off, ".dae": _prepare_dae, ".glb": _prepare_gltf, ".gltf": _prepare_gltf,
+    ".stl": _prepare_stl, ".ply": _prepare_ply,
 }  # fmt: skip
 
 

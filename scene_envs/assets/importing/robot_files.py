@@ -372,7 +372,13 @@ def read_mjcf(path: Path) -> Model:
         raise CorruptFileError(f"{path} cannot be read as MJCF: {' '.join(str(error).split())}") from error
     data: Any = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    root = _root_body(model, path)
+    roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
+    if len(roots) > 1:
+        names = ", ".join(repr(model.body(body).name) for body in roots)
+        raise InvalidInputError(f"{path} holds {len(roots)} bodies ({names}); an asset is one, so put each in a file")
+    if not roots and not model.ngeom:
+        raise InvalidInputError(f"{path} holds no <body> and no <geom>")
+    root = roots[0] if roots else 0  # the world itself where it holds all geoms
     bodies = [body for body in range(model.nbody) if root in (0, int(model.body_rootid[body]))]
     base = np.linalg.inv(pose_of(data.xpos[root], data.xmat[root].reshape(3, 3)))
     visuals: list[Shape] = []
@@ -400,23 +406,11 @@ def read_mjcf(path: Path) -> Model:
     held = [j for j in range(model.njnt) if j not in free and model.jnt_bodyid[j] in bodies]
     if movable := [model.joint(j).name or f"joint {j}" for j in held]:
         notes.append(f"movable joints frozen at zero: {', '.join(movable)}")
-    notes += [
-        f"not read: {key[4:]} of the free joint" for key in _OF_FREE if free and getattr(model, key)[free[0]].any()
-    ]
+    drag = [key[4:] for key in _OF_FREE if free and getattr(model, key)[free[0]].any()]
+    notes += [f"not read: {name} of the free joint" for name in drag]
     if not free:
         notes.append("it has no free joint: it is welded (`welded: false` makes it free)")
     return Model(tuple(visuals), tuple(collisions), tuple(inertials), None if free else True, tuple(notes))
-
-
-def _root_body(model: Any, path: Path) -> int:
-    """The one body on the world; the world itself where it holds all geoms."""
-    roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
-    if len(roots) > 1:
-        names = ", ".join(repr(model.body(body).name) for body in roots)
-        raise InvalidInputError(f"{path} holds {len(roots)} bodies ({names}); an asset is one, so put each in a file")
-    if not roots and not model.ngeom:
-        raise InvalidInputError(f"{path} holds no <body> and no <geom>")
-    return roots[0] if roots else 0
 
 
 def _geom(model: Any, geom: int, pose: Array, path: Path, name: str) -> Shape | None:
@@ -593,8 +587,7 @@ class _Stage:
         """(N, 3) in 0..255 from the linear colours of a prim, N 0 without any."""
         from pxr import UsdGeom, UsdShade
 
-        own = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
-        values = own.ComputeFlattened(0.0) or ()
+        values = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor").ComputeFlattened(0.0) or ()
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
         for shader in material.GetPrim().GetChildren() if material else ():
             diffuse = shader.GetAttribute("inputs:diffuseColor")

@@ -187,24 +187,20 @@ def build_in_time(request: tuple[Path, AssetEntry]) -> tuple[Asset, AssetReport]
         return build_asset(*request)
 
 
-def _build_apart(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
-    """As :func:`build_in_time`, in a process of its own; InvalidInputError when it takes too long or crashes."""
-    with timed(path):
-        try:
-            return run_apart(f"{__name__}:build_in_time", (path, entry), seconds_left())  # type: ignore[no-any-return]
-        except WorkerFailure as failure:
-            if failure.is_late:
-                raise too_slow("") from None
-            raise InvalidInputError(f"{path}: the import {failure}; simplify the file") from failure
-
-
 @cache
 def _built(path: Path, entry: AssetEntry, stamp: tuple[int, int]) -> tuple[Asset, AssetReport]:
+    """As :func:`build_in_time`, large files in a process of their own; InvalidInputError when it is late or crashes."""
     try:
         with timed(path, READ_HERE):
             asset, report = in_time(lambda: build_asset(path, entry))
     except LargeImportError:
-        asset, report = _build_apart(path, entry)
+        with timed(path):
+            try:
+                asset, report = run_apart(f"{__name__}:build_in_time", (path, entry), seconds_left())
+            except WorkerFailure as failure:
+                if failure.is_late:
+                    raise too_slow("") from None
+                raise InvalidInputError(f"{path}: the import {failure}; simplify the file") from failure
     level = logging.WARNING if report.warnings else logging.INFO
     _LOGGER.log(level, "%s", report)
     return asset, report
