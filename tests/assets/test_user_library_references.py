@@ -292,8 +292,8 @@ def test_a_corner_without_a_joint_keeps_its_bind_shape_and_morphs_are_named(tmp_
     assert cKDTree(read_mesh(tmp_path / "it.dae")[0].vertices).query(first)[0][0] < 1e-6
     sources = """<source id="mt"><IDREF_array id="mta" count="1">g</IDREF_array><technique_common><accessor
 source="#mta" count="1"><param name="MORPH_TARGET" type="IDREF"/></accessor></technique_common></source><source id="mw">
-<float_array id="mwa" count="1">0</float_array><technique_common><accessor source="#mwa" count="1"><param name="MORPH_WEIGHT"
-type="float"/></accessor></technique_common></source>"""
+<float_array id="mwa" count="1">0</float_array><technique_common><accessor source="#mwa" count="1"><param
+name="MORPH_WEIGHT" type="float"/></accessor></technique_common></source>"""
     targets = '<input semantic="MORPH_TARGET" source="#mt"/><input semantic="MORPH_WEIGHT" source="#mw"/>'
     morph = f'<morph source="#g">{sources}<targets>{targets}</targets></morph>'
     more = f'<library_controllers><controller id="k">{morph}</controller></library_controllers>'

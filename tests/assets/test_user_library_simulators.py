@@ -353,6 +353,17 @@ def test_a_model_that_another_attaches_is_no_asset_and_joins_its_mass(tmp_path: 
     assert cup.mass == pytest.approx(1000 * (0.2**3 + 0.2 * 0.1 * 0.05))
 
 
+def test_textures_of_mjcf_are_not_opened(tmp_path: Path) -> None:
+    """They are not read, so one that is lost costs nothing."""
+    sides = " ".join(f"file{side}='lost.png'" for side in ("right", "left", "up", "down", "front", "back"))
+    textures = f"<texture name='t' type='2d' file='lost.png'/><texture type='skybox' {sides}/>"
+    head = f"<mujoco><asset>{textures}<material name='m' texture='t'/></asset><worldbody><body><freejoint/>"
+    geom = "<geom type='box' size='.1 .1 .1' material='m'/>"
+    asset = listed(tmp_path, "it.xml", f"{head}{geom}</body></worldbody></mujoco>")
+    assert asset.mass == pytest.approx(8)
+    assert "not read: asset/texture (2 times), material/@texture" in said(tmp_path)
+
+
 def test_drag_of_a_free_joint_and_masks_of_geoms_are_named(tmp_path: Path) -> None:
     geom = "<geom type='box' size='.1 .1 .1' contype='4' conaffinity='2'/>"
     head = "<mujoco><default><joint damping='1'/></default><worldbody><body><joint type='free' frictionloss='1'/>"

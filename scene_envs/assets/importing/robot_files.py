@@ -37,12 +37,7 @@ from scene_envs.assets.shapes import MassProperties
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 
 _Colors = Mapping[str, Color | None]
-_ZERO = (0.0, 0.0, 0.0)
 _TO_WORLD = "a joint holds it at `world`"
-_OF_FREE = ("dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness")
-"""What MuJoCo gives a free joint and an asset does not have."""
-_NOT_OF_USD = ("kinematicEnabled", "velocity", "angularVelocity", "restitution")
-"""Properties of UsdPhysics that an asset does not have."""
 
 
 def _unread(root: Element, kind: str) -> list[str]:
@@ -345,13 +340,13 @@ def _placed(path: Path, base: Array, element: Element, where: str) -> Array:
     origin = element.find("origin")
     if origin is None:
         return base
-    xyz = numbers(origin.get("xyz"), 3, path, f"origin xyz of {where}", _ZERO)
+    xyz = numbers(origin.get("xyz"), 3, path, f"origin xyz of {where}", (0.0, 0.0, 0.0))
     if origin.get("rpy") and origin.get("quat_xyzw"):
         raise CorruptFileError(f"{path}: the origin of {where} has both rpy and quat_xyzw; keep one of them")
     if origin.get("quat_xyzw"):
         quaternion = numbers(origin.get("quat_xyzw"), 4, path, f"origin quat_xyzw of {where}")
         return base @ pose_of(xyz, _from_quaternion(quaternion, path, where))
-    rpy = numbers(origin.get("rpy"), 3, path, f"origin rpy of {where}", _ZERO)
+    rpy = numbers(origin.get("rpy"), 3, path, f"origin rpy of {where}", (0.0, 0.0, 0.0))
     return base @ pose_of(xyz, Rotation.from_euler("xyz", rpy).as_matrix())
 
 
@@ -367,6 +362,9 @@ def read_mjcf(path: Path) -> Model:
         spec = mujoco.MjSpec.from_file(str(path))
         for mesh in spec.meshes:
             check_file(path.parent / spec.meshdir / mesh.file)
+        for texture in spec.textures:  # none is read, whatever its size, and its file may be lost
+            texture.file, texture.cubefiles, texture.builtin = "", [""] * 6, mujoco.mjtBuiltin.mjBUILTIN_FLAT
+            texture.width = texture.height = 1
         model: Any = spec.compile()
     except ValueError as error:
         raise CorruptFileError(f"{path} cannot be read as MJCF: {' '.join(str(error).split())}") from error
@@ -406,7 +404,8 @@ def read_mjcf(path: Path) -> Model:
     held = [j for j in range(model.njnt) if j not in free and model.jnt_bodyid[j] in bodies]
     if movable := [model.joint(j).name or f"joint {j}" for j in held]:
         notes.append(f"movable joints frozen at zero: {', '.join(movable)}")
-    drag = [key[4:] for key in _OF_FREE if free and getattr(model, key)[free[0]].any()]
+    drags = ("dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness") if free else ()
+    drag = [key[4:] for key in drags if getattr(model, key)[free[0]].any()]
     notes += [f"not read: {name} of the free joint" for name in drag]
     if not free:
         notes.append("it has no free joint: it is welded (`welded: false` makes it free)")
@@ -478,8 +477,9 @@ def read_usd(path: Path) -> Model:
         raise InvalidInputError(f"{path} holds {len(found)} bodies ({names}); an asset is one, so put each in a file")
     if many := [prim.GetPath() for prim in prims if prim.IsA(UsdGeom.PointInstancer)]:
         raise InvalidInputError(f"{path}: {many[0]} is a point instancer, which is not read; make its instances prims")
+    lacking = ("kinematicEnabled", "velocity", "angularVelocity", "restitution")  # what an asset does not have
     for prim in prims:
-        values = [(name, prim.GetAttribute(f"physics:{name}")) for name in _NOT_OF_USD]
+        values = [(name, prim.GetAttribute(f"physics:{name}")) for name in lacking]
         reading.notes += [f"not read: {n} of {prim.GetPath()}" for n, value in values if value and np.any(value.Get())]
         if prim.IsA(UsdGeom.Gprim):
             reading.add(prim)
