@@ -185,36 +185,28 @@ def _color(value: Any, where: str) -> Color:
     raise InvalidInputError(f"{where}: color must be [r, g, b] in 0..255 or '#rrggbb', got {value!r}")
 
 
-class Weight(NamedTuple):
-    """Mass properties of an asset, with remarks for the report."""
-
-    properties: MassProperties
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
-
-
 def weigh(
     given: MassProperties | None, parts: Sequence[ConvexPart], solid: MassProperties, entry: AssetEntry
-) -> Weight:
-    """Mass properties of an asset of these fine parts whose ``solid`` is given at 1 kg/m^3. Those ``given`` by the file
-    are kept where they are possible; an inertia of zeros is missing. A user's ``mass`` (kg) keeps the file's
-    distribution; a user's ``density`` (kg/m^3) fills the shape evenly.
+) -> tuple[MassProperties, tuple[str, ...], tuple[str, ...]]:
+    """Mass properties of an asset of these fine parts whose ``solid`` is given at 1 kg/m^3, with notes and warnings.
+    Those ``given`` by the file are kept where they are possible; an inertia of zeros is missing. A user's ``mass`` (kg)
+    keeps the file's distribution; a user's ``density`` (kg/m^3) fills the shape evenly.
     """
     mass = entry.mass
     if entry.density is not None:
-        return Weight(heavier(solid, entry.density), (), ())
+        return (heavier(solid, entry.density), (), ())
     if given is None or given.mass <= 0:
         known = "inertia computed from the shape"
         if mass is None:
             known, mass = f"mass and {known} at {DEFAULT_DENSITY:g} kg/m^3", DEFAULT_DENSITY * solid.mass
         why = "the file gives none" if given is None else f"the file gives a mass of {given.mass:g} kg"
-        return Weight(heavier(solid, mass / solid.mass), (f"{known}: {why}",), ())
+        return (heavier(solid, mass / solid.mass), (f"{known}: {why}",), ())
     if mass is None:
         found = given.mass / solid.mass
         if not _POSSIBLE[0] <= found <= _POSSIBLE[1]:
             reason = f"the file's {given.mass:g} kg would be {found:.3g} kg/m^3"
             text = f"mass and inertia recomputed at {DEFAULT_DENSITY:g} kg/m^3: {reason}"
-            return Weight(heavier(solid, DEFAULT_DENSITY), (), (text,))
+            return (heavier(solid, DEFAULT_DENSITY), (), (text,))
         mass = given.mass
     inertia, even = given.inertia * (mass / given.mass), heavier(solid, mass / solid.mass)
     notes: tuple[str, ...] = ()
@@ -222,11 +214,11 @@ def weigh(
         inertia, notes = even.inertia, ("inertia computed from the shape: the file gives none",)
     wrong = why_impossible(inertia, given.center_of_mass, parts, even)
     if wrong:
-        return Weight(even, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
+        return (even, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
     inertia = 0.5 * (inertia + inertia.T)
     low, middle, high = np.linalg.eigvalsh(inertia)
     inertia += max(0.0, high * (1.0 + 1e-9) - low - middle) * np.eye(3)  # MuJoCo refuses a plate by a rounding
-    return Weight(MassProperties(mass, given.center_of_mass, inertia), notes, ())
+    return (MassProperties(mass, given.center_of_mass, inertia), notes, ())
 
 
 def why_impossible(inertia: Array, center: Array, parts: Sequence[ConvexPart], computed: MassProperties) -> str:
@@ -329,9 +321,7 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
         raise InvalidInputError(f"{path} has neither visual nor collision geometry")
     if not model.collisions:
         notes.append("no collision geometry: the visual one is used")
-    bare = (meshes_of(shape) if shape.kind == "mesh" else visual_of(shape, None) for shape in shapes)
-    corners = [mesh.vertices for meshes in bare for mesh in meshes]
-    size = float(np.linalg.norm(np.ptp(np.concatenate(corners), axis=0)))
+    size = _diagonal(shapes)
     if not _SMALL <= size <= _LARGE:
         warnings.append(f"it is {size:.3g} m large; if the file is not in metres, set `scale`")
     pieces = _collide(shapes, entry, size, path, notes, warnings)
@@ -342,11 +332,11 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     if static and model.faults:
         raise CorruptFileError("; ".join(model.faults))
     notes += model.faults
-    weight = weigh(_given(model, {}), parts, solid, entry)
-    properties = mass_properties(parts, 0.0) if static else weight.properties
-    if not static:
-        notes += weight.notes
-        warnings += weight.warnings
+    properties, remarks, faults = weigh(_given(model, {}), parts, solid, entry)
+    if static:
+        properties, remarks, faults = mass_properties(parts, 0.0), (), ()
+    notes += remarks
+    warnings += faults
     drawn = [(shape.link, visual_of(shape, entry.color)) for shape in model.visuals or shapes]
     visual = join(*(mesh for _, meshes in drawn for mesh in meshes))
     meshes = [shape for shape in (*model.visuals, *shapes) if shape.kind == "mesh"]
@@ -381,8 +371,8 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     )
     x, y, z = (shift + 0.0).tolist()
     density = 0.0 if static else properties.mass / solid.mass
-    remarks = tuple(notes), tuple(warnings)
-    return asset, AssetReport(entry.name, path, properties.mass, density, len(fine), (x, y, z), *remarks)
+    said = tuple(notes), tuple(warnings)
+    return asset, AssetReport(entry.name, path, properties.mass, density, len(fine), (x, y, z), *said)
 
 
 def _given(model: Model, rows: Mapping[int, int], row: int = 0) -> MassProperties | None:
@@ -431,10 +421,10 @@ def _articulate(
         own = [piece for piece in pieces if rows[piece.link] == row]
         parts = [part for piece in own for part in piece.parts]
         even = merged_inertial([piece.solid for piece in own])
-        weight = weigh(_given(model, rows, row), parts, even, dataclasses.replace(entry, mass=None))
+        weight, _, faults = weigh(_given(model, rows, row), parts, even, dataclasses.replace(entry, mass=None))
         name = joints[-1].link if row else "base"
-        warnings += [f"link {name!r}: {text}" for text in weight.warnings if row]
-        mass, center, inertia = moved_inertial(back, weight.properties)
+        warnings += [f"link {name!r}: {text}" for text in faults if row]
+        mass, center, inertia = moved_inertial(back, weight)
         look = join(*(mesh for link, meshes in drawn if rows[link] == row for mesh in meshes))
         look = moved(look, back[:3, :3], back[:3, 3])
         turned = [ConvexPart(part.vertices @ back[:3, :3].T, part.faces) for part in parts]
@@ -502,6 +492,12 @@ class _Piece(NamedTuple):
     link: int  # as of the shape
     parts: list[ConvexPart]
     solid: MassProperties  # at 1 kg/m^3
+
+
+def _diagonal(shapes: Sequence[Shape]) -> float:
+    """Length (m) of the diagonal of the bounding box of all shapes."""
+    meshes = [mesh for s in shapes for mesh in (meshes_of(s) if s.kind == "mesh" else visual_of(s, None))]
+    return float(np.linalg.norm(np.ptp(np.concatenate([mesh.bounds for mesh in meshes]), axis=0)))
 
 
 def _collide(
