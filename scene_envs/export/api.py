@@ -13,7 +13,7 @@ from typing import Any
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.export.formats import _FORMATS, resolve_formats
 from scene_envs.export.placed import AssetFiles, identifier, place
-from scene_envs.export.randomization import randomize, read_randomization
+from scene_envs.export.randomization import randomize, read_randomization, record
 from scene_envs.files import write_json
 from scene_envs.physics.parts import FRICTION
 from scene_envs.scene import SceneBatch
@@ -62,8 +62,8 @@ def export(
         formats: One or several names, or ``"all"`` for those with a file per scene that can be written here; see
             :func:`scene_envs.export.list_formats`.
         friction: Coulomb friction coefficient between any two surfaces; by default that of :mod:`scene_envs.physics`.
-        randomization: Distributions of mass, friction and colour (:mod:`scene_envs.export.randomization`);
-            ``randomization.json`` of each scene says what its objects got.
+        randomization: Distributions of mass, friction, colours, textures, light and camera
+            (:mod:`scene_envs.export.randomization`); ``randomization.json`` of each scene says what it got.
 
     Raises:
         UnknownNameError: no such format.
@@ -74,7 +74,7 @@ def export(
         raise InvalidInputError(f"friction must be a finite number >= 0, got {friction}")
     names = resolve_formats(formats)
     writers = {name: _FORMATS[name].writer() for name in names}
-    settings = read_randomization(randomization, names)
+    settings = read_randomization(randomization)
     placed = [randomize(scene, settings) for scene in place(batch, friction)]
     root = Path(output)
     manifest = _claim(root, batch, friction, settings)
@@ -86,8 +86,8 @@ def export(
         folder = root / place_of
         folder.mkdir(exist_ok=True)
         if settings:
-            values = {x.name: {"mass": x.mass, "friction": x.friction, "color": x.color} for x in scene.objects}
-            write_json(folder / "randomization.json", {**settings, "verdict": "nominal", "objects": values})
+            content = record(scene, settings, sorted({*manifest["formats"], *names}))
+            write_json(folder / "randomization.json", content)
         scenes.append({name: whole.get(name) or write(scene, files, folder) for name, write in writers.items()})
         if not any(folder.iterdir()):
             folder.rmdir()

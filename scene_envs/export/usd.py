@@ -15,11 +15,22 @@ import numpy as np
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import RECIPES, Asset
-from scene_envs.export.placed import AssetFiles, PlacedScene, face_colors, quaternion, visual_mesh
+from scene_envs.export.placed import (
+    AssetFiles,
+    Light,
+    PlacedObject,
+    PlacedScene,
+    camera_axes,
+    face_colors,
+    linear,
+    pattern_uv,
+    quaternion,
+    visual_mesh,
+)
 from scene_envs.export.urdf import relative
 from scene_envs.physics.mujoco import SOLIMP, SOLREF, TIMESTEP
 from scene_envs.physics.parts import GRAVITY, principal_inertia
-from scene_envs.scene_types import SceneType
+from scene_envs.scene_types import Camera, SceneType
 
 _SCENE = {
     "mjc:option:cone": ("token", "elliptic"),
@@ -39,6 +50,8 @@ _QCODES = {
 }  # fmt: skip
 """Wikidata items by a word of the asset's name."""
 _PHYSICAL_OBJECT = "Q223557"
+_BRIGHTNESS = {"DistantLight": 1000.0, "DomeLight": 300.0}
+"""Intensities (nit) of the lamp, and of the light from all sides that is with it."""
 _THUMBNAIL = 256
 """Width and height of an asset's picture, pixels."""
 
@@ -46,7 +59,8 @@ _THUMBNAIL = 256
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene_000.usda`` beside the folder ``assets``, so that every reference stays below the file's own folder.
 
-    One prim under ``/World`` per object; welded ones are colliders without a rigid body; units m and kg, z up.
+    One prim under ``/World`` per object; welded ones are colliders without a rigid body; units m and kg, z up. A light
+    or a camera that was drawn for the scene is ``/World/lamp``, with ``/World/sky``, or ``/World/camera``.
     """
     from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics
 
@@ -76,8 +90,61 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
             surface = UsdPhysics.MaterialAPI.Apply(stage.OverridePrim(f"/World/{item.name}/surface"))
             surface.CreateStaticFrictionAttr(item.friction)
             surface.CreateDynamicFrictionAttr(item.friction)
+        if item.tinted or item.texture != "none":
+            _change_look(stage, item, files, path.parent)
+    if scene.light != Light():
+        _add_light(stage, scene.light)
+    if scene.own_camera:
+        _add_camera(stage, scene.own_camera)
     stage.GetRootLayer().Save()
     return path
+
+
+def _change_look(stage: Any, item: PlacedObject, files: AssetFiles, folder: Path) -> None:
+    """The object's texture and colour over those of its asset: a palette without, and an image with a texture."""
+    from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
+
+    prim = f"/World/{item.name}"
+    if item.texture == "none":
+        palette = np.unique(face_colors(visual_mesh(item.asset)), axis=0) / 255.0
+        colors = Vt.Vec3fArray.FromNumpy(linear(palette * item.color).astype(np.float32))
+        UsdGeom.PrimvarsAPI(stage.OverridePrim(f"{prim}/visual")).GetPrimvar("displayColor").Set(colors)
+        return
+    reader = _define_shader(stage, f"{prim}/surface/st", "UsdPrimvarReader_float2", {"varname": ("String", "st")})
+    image = f"./{relative(files.visual(item.asset, item.texture).with_suffix('.png'), folder)}"
+    values = {"file": ("Asset", image), "scale": ("Float4", Gf.Vec4f(*linear(item.color).tolist(), 1.0))}
+    texture = _define_shader(stage, f"{prim}/surface/texture", "UsdUVTexture", values)
+    place = texture.CreateInput("st", Sdf.ValueTypeNames.Float2)
+    place.ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float2))
+    shader = UsdShade.Shader(stage.OverridePrim(f"{prim}/surface/shader"))
+    color = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+    color.ConnectToSource(texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
+
+
+def _add_light(stage: Any, light: Light) -> None:
+    from pxr import Gf, UsdGeom, UsdLux
+
+    up = np.eye(3)[np.argmin(np.abs(light.direction))]
+    w, *turn = quaternion(camera_axes((0.0, 0.0, 0.0), light.direction, up)).tolist()
+    for name, kind in (("lamp", "DistantLight"), ("sky", "DomeLight")):
+        lamp = getattr(UsdLux, kind).Define(stage, f"/World/{name}")
+        lamp.CreateIntensityAttr(_BRIGHTNESS[kind] * (light.intensity if name == "lamp" else 1.0))
+        if name == "lamp":
+            lamp.CreateColorAttr(Gf.Vec3f(*linear(light.color).tolist()))
+            UsdGeom.Xformable(lamp).AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, *turn))
+
+
+def _add_camera(stage: Any, camera: Camera) -> None:
+    from pxr import Gf, UsdGeom
+
+    view = UsdGeom.Camera.Define(stage, "/World/camera")
+    height = view.GetHorizontalApertureAttr().Get() * camera.height / camera.width
+    view.CreateVerticalApertureAttr(height)
+    view.CreateFocalLengthAttr(0.5 * height / float(np.tan(np.radians(camera.fov_y) / 2.0)))
+    view.CreateClippingRangeAttr(Gf.Vec2f(0.01, 1000.0))
+    view.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*camera.position))
+    w, *turn = quaternion(camera_axes(camera.position, camera.target, camera.up)).tolist()
+    view.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, *turn))
 
 
 def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder: Path) -> Path:
@@ -98,12 +165,13 @@ def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder:
     material = _define_material(stage, f"/{name}/surface", files.friction)
     mesh = visual_mesh(asset)
     visual = _define_mesh(stage, f"/{name}/visual", mesh.vertices, mesh.faces)
-    colors = face_colors(mesh) / 255.0
-    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # USD keeps linear colour
-    primvar = UsdGeom.PrimvarsAPI(visual).CreatePrimvar(
-        "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.uniform
-    )
-    primvar.Set(Vt.Vec3fArray.FromNumpy(linear.astype(np.float32)))
+    palette, cells = np.unique(face_colors(mesh), axis=0, return_inverse=True)
+    primvars, names = UsdGeom.PrimvarsAPI(visual), Sdf.ValueTypeNames
+    primvar = primvars.CreatePrimvar("displayColor", names.Color3fArray, UsdGeom.Tokens.uniform)
+    primvar.Set(Vt.Vec3fArray.FromNumpy(linear(palette / 255.0).astype(np.float32)))
+    primvar.SetIndices(Vt.IntArray.FromNumpy(cells.ravel().astype(np.int32)))
+    place = primvars.CreatePrimvar("st", names.TexCoord2fArray, UsdGeom.Tokens.vertex)
+    place.Set(Vt.Vec2fArray.FromNumpy(pattern_uv(mesh).astype(np.float32)))
     visual.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.asarray(mesh.vertex_normals, dtype=np.float32)))
     visual.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     UsdShade.MaterialBindingAPI.Apply(visual.GetPrim()).Bind(material)
@@ -172,21 +240,28 @@ def _define_material(stage: Any, path: str, friction: float) -> Any:
 
     material = UsdShade.Material.Define(stage, path)
     _label(material, "material", "unspecified")
-    reader = UsdShade.Shader.Define(stage, f"{path}/colors")
-    reader.CreateIdAttr("UsdPrimvarReader_float3")
-    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
-    reader.CreateInput("fallback", Sdf.ValueTypeNames.Float3).Set(Gf.Vec3f(0.5, 0.5, 0.5))
-    shader = UsdShade.Shader.Define(stage, f"{path}/shader")
-    shader.CreateIdAttr("UsdPreviewSurface")
+    values = {"varname": ("String", "displayColor"), "fallback": ("Float3", Gf.Vec3f(0.5, 0.5, 0.5))}
+    reader = _define_shader(stage, f"{path}/colors", "UsdPrimvarReader_float3", values)
+    values = {"roughness": ("Float", 0.7), "metallic": ("Float", 0.0)}
+    shader = _define_shader(stage, f"{path}/shader", "UsdPreviewSurface", values)
     color = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
     color.ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float3))
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.7)
-    shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
     material.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
     surface = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
     surface.CreateStaticFrictionAttr(friction)
     surface.CreateDynamicFrictionAttr(friction)
     return material
+
+
+def _define_shader(stage: Any, path: str, kind: str, values: dict[str, tuple[str, Any]]) -> Any:
+    """A shader of the given kind; values (type, value) by input."""
+    from pxr import Sdf, UsdShade
+
+    shader = UsdShade.Shader.Define(stage, path)
+    shader.CreateIdAttr(kind)
+    for name, (kind_of, value) in values.items():
+        shader.CreateInput(name, getattr(Sdf.ValueTypeNames, kind_of)).Set(value)
+    return shader
 
 
 def _define_mesh(stage: Any, path: str, vertices: Array, faces: Any) -> Any:

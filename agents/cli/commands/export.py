@@ -64,7 +64,7 @@ class ExportConfig(DrawKeys, EngineKeys):
         count: number of scenes; null for all of them, or 16 from a prior.
         project: make the scenes simulation-ready first (project out of penetration, then settle).
         friction: coefficient of friction of all surfaces.
-        randomization: YAML file with distributions of mass, friction and color; empty for none.
+        randomization: YAML file with distributions of mass, friction, color, texture, light and camera; empty for none.
         output: folder for assets/ and scene_000/, scene_001/, ...
     """
 
@@ -88,7 +88,8 @@ def check(settings: ExportConfig) -> None:
             "export: name either a scene file, run or dataset, as in scenes=runs/mine, or a prior, as in "
             "prior=dimsum_table"
         )
-    read_randomization(settings.randomization, check_formats(settings.formats))
+    check_formats(settings.formats)
+    read_randomization(settings.randomization)
 
 
 def run(settings: ExportConfig, run: Run) -> None:
