@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _MAX_COLORS = 1024
 _CELL = 4
 """Width of a colour's cell in the palette, pixels."""
-_PATTERN = 64
+_PATTERN = 256
 """Width and height of a procedural texture, pixels."""
 TEXTURES = ("none", "checker", "gradient", "flat")
 """An object's own colours, or a pattern in place of them: 8 by 8 cells of white and grey, white to grey, or white."""

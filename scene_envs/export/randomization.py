@@ -99,12 +99,13 @@ def randomize(scene: PlacedScene, settings: Mapping[str, Any]) -> PlacedScene:
         direction = np.add(light.direction, first.get("light_direction", 0.0)).tolist()
         intensity = float(first.get("light_intensity", [1.0])[0])
         light = Light(tuple(direction), intensity, _color(first.get("light_color", light.color)))
-    if moves := {key[7:]: value for key, value in first.items() if key.startswith("camera")}:
-        moves |= {"fov_y": moves["fov_y"][0]} if "fov_y" in moves else {}
-        camera = replace(camera, **{key: np.add(getattr(camera, key), move).tolist() for key, move in moves.items()})
+    for field in (key[7:] for key in first if key.startswith("camera")):
+        move = first["camera_fov_y"][0] if field == "fov_y" else first[f"camera_{field}"]
+        value = np.add(getattr(camera, field), move).tolist()
+        camera = replace(camera, **{field: value if field == "fov_y" else tuple(value)})
+    if camera != scene.camera:
         Pinhole.at(camera.position, camera.target, camera.up, camera.fov_y, camera.width, camera.height)
-        return replace(scene, objects=tuple(objects), light=light, own_camera=camera)
-    return replace(scene, objects=tuple(objects), light=light)
+    return replace(scene, objects=tuple(objects), light=light, own_camera=camera)
 
 
 def record(scene: PlacedScene, settings: Mapping[str, Any], formats: Iterable[str]) -> dict[str, Any]:

@@ -94,8 +94,8 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
             _change_look(stage, item, files, path.parent)
     if scene.light != Light():
         _add_light(stage, scene.light)
-    if scene.own_camera:
-        _add_camera(stage, scene.own_camera)
+    if scene.camera != scene.scene_type.camera:
+        _add_camera(stage, scene.camera)
     stage.GetRootLayer().Save()
     return path
 

@@ -110,6 +110,8 @@ def _model(
     for material in shared.findall("material"):
         shared.remove(material)
     parts = cycle(f"{files.name(asset)}_{part.stem}" for asset in assets for part in files.parts(asset))
+    reach = np.linalg.norm(np.subtract(scene.camera.position, scene.camera.target))
+    ET.SubElement(root, "statistic", extent=f"{reach:g}")  # from which renderers take what is too near to be seen
     for index, column in enumerate(columns):  # far from each other: as compiled, no two bodies touch
         place = f"{_APART * index} 0 {_APART}"
         body = ET.SubElement(world, "body", {"name": column.name, "pos": place, "gravcomp": "1"})
