@@ -43,7 +43,8 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
         name, mesh = files.look(item), textured_mesh(item.asset, item.texture)
         if item.tinted:
             name, mesh = f"{item.name}.color", mesh.copy()
-            mesh.visual.material.baseColorFactor = np.rint(255.0 * np.append(linear(item.color), 1.0)).astype(np.uint8)
+            visual: Any = mesh.visual
+            visual.material.baseColorFactor = np.rint(255.0 * np.append(linear(item.color), 1.0)).astype(np.uint8)
         graph.geometry[name] = mesh
         graph.graph.update(item.name, "z_up", matrix=item.matrix, geometry=name)
     path = folder / "scene.glb"

@@ -69,7 +69,7 @@ def new_model(
     ET.SubElement(world, "light", light, dir=numbers(scene.light.direction), diffuse=numbers(diffuse(scene.light)))
     axes = numbers(camera_axes(camera.position, camera.target, camera.up)[:, :2].T)
     place = {"pos": numbers(camera.position), "xyaxes": axes, "fovy": number(camera.fov_y)}
-    ET.SubElement(world, "camera", name="scene", **place)
+    ET.SubElement(world, "camera", place, name="scene")
     looks = dict(sorted({(item.category, item.texture): item for item in objects}.items())).values()
     for item in looks:
         name, visual = files.look(item), files.visual(item.asset, item.texture)

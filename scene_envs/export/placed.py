@@ -430,14 +430,14 @@ def _write_parts(parts: Sequence[ConvexPart], folder: Path, prefix: str) -> list
 
 def _write_visual(mesh: trimesh.Trimesh, path: Path) -> Path:
     """The mesh with its image: most loaders read textures, and few read colours of vertices."""
-    mesh, white = mesh.copy(), [255, 255, 255, 255]
-    image = mesh.visual.material.baseColorTexture
-    material = SimpleMaterial(image, white, white, [0, 0, 0, 255], name=path.name)
-    mesh.visual = trimesh.visual.TextureVisuals(mesh.visual.uv, material)
-    text, others = export_obj(mesh, include_normals=True, return_texture=True, mtl_name=f"{path.name}.mtl", header=None)
-    for name, data in others.items():
+    shown, white = mesh.copy(), [255, 255, 255, 255]
+    visual: Any = shown.visual
+    material = SimpleMaterial(visual.material.baseColorTexture, white, white, [0, 0, 0, 255], name=path.name)
+    shown.visual = trimesh.visual.TextureVisuals(visual.uv, material)
+    mtl = f"{path.name}.mtl"
+    text, others = export_obj(shown, include_normals=True, return_texture=True, mtl_name=mtl, header=None)
+    for name, data in {**others, f"{path.name}.obj": text.encode()}.items():
         path.with_name(name).write_bytes(data)
-    path.with_suffix(".obj").write_text(text)
     return path.with_suffix(".obj")
 
 

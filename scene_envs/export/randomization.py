@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from scene_envs.errors import InvalidInputError
-from scene_envs.export.placed import TEXTURES, Light, PlacedScene
+from scene_envs.export.placed import TEXTURES, PlacedScene
 from scene_envs.render.raster import Pinhole
 
 DISTRIBUTIONS = ("uniform", "normal", "lognormal", "triangular")
@@ -36,6 +36,7 @@ by this order.
 """
 PHYSICS = frozenset({"mass", "friction"})
 _NAMES = tuple(KEYS)
+_VECTORS = ("color", "light_direction", "light_color", "camera_position", "camera_target")
 _HELD = {"npz": (), "glb": _NAMES[2:4], "urdf": _NAMES[:4], "drake": _NAMES[:4], "sdf": _NAMES[:7]}
 """Keys that a format holds, where these are not all."""
 
@@ -75,37 +76,31 @@ def randomize(scene: PlacedScene, settings: Mapping[str, Any]) -> PlacedScene:
     """
     poses = b"".join(item.matrix.tobytes() for item in scene.objects)
     numbers = np.frombuffer(hashlib.sha256(poses).digest(), dtype=np.uint32).tolist()
-    draws = {key: _draw(settings, key, max(1, len(scene.objects)), numbers) for key in settings.keys() - {"seed"}}
+    count = len(scene.objects)
+    draws = {key: _draw(settings, key, 1 if "_" in key else count, numbers) for key in settings.keys() - {"seed"}}
     for key in draws.keys() & {*PHYSICS, "light_intensity"}:
-        if not draws[key][: 1 if key == "light_intensity" else None, 0].min() > 0:
-            raise InvalidInputError(f"randomization: {key}={draws[key][:, 0].min():g} was drawn; it must be above 0")
+        if not (draws[key] > 0).all():
+            raise InvalidInputError(f"randomization: {key}={draws[key].min():g} was drawn; it must be above 0")
     objects = []
     for index, item in enumerate(scene.objects):
-        own = {key: values[index] for key, values in draws.items()}
-        factor = float(own["mass"][0]) if "mass" in own else 1.0
-        objects.append(
-            replace(
-                item,
-                mass=item.mass * factor,
-                inertia=item.inertia * factor,
-                friction=float(own["friction"][0]) if "friction" in own else item.friction,
-                color=_color(own.get("color", item.color)),
-                texture=str(own["texture"][0]) if "texture" in own else item.texture,
-            )
-        )
-    first = {key: values[0] for key, values in draws.items()}
-    light, camera = scene.light, scene.camera
-    if any(key.startswith("light") for key in first):
-        direction = np.add(light.direction, first.get("light_direction", 0.0)).tolist()
-        intensity = float(first.get("light_intensity", [1.0])[0])
-        light = Light(tuple(direction), intensity, _color(first.get("light_color", light.color)))
-    for field in (key[7:] for key in first if key.startswith("camera")):
-        move = first["camera_fov_y"][0] if field == "fov_y" else first[f"camera_{field}"]
-        value = np.add(getattr(camera, field), move).tolist()
-        camera = replace(camera, **{field: value if field == "fov_y" else tuple(value)})
-    if camera != scene.camera:
-        Pinhole.at(camera.position, camera.target, camera.up, camera.fov_y, camera.width, camera.height)
-    return replace(scene, objects=tuple(objects), light=light, own_camera=camera)
+        own: dict[str, Any] = {key: values[index] for key, values in draws.items() if "_" not in key}
+        factor = own.pop("mass", 1.0)
+        own |= {"color": _color(own["color"])} if "color" in own else {}
+        objects.append(replace(item, mass=item.mass * factor, inertia=item.inertia * factor, **own))
+    light: dict[str, Any] = {key[6:]: values[0] for key, values in draws.items() if key.startswith("light")}
+    camera: dict[str, Any] = {key[7:]: values[0] for key, values in draws.items() if key.startswith("camera")}
+    if "direction" in light:
+        light["direction"] = tuple((scene.light.direction + light["direction"]).tolist())
+    if "color" in light:
+        light["color"] = _color(light["color"])
+    for field, value in camera.items():
+        moved = np.add(getattr(scene.camera, field), value)
+        camera[field] = tuple(moved.tolist()) if moved.ndim else float(moved)
+    view = replace(scene.camera, **camera)
+    if camera:
+        Pinhole.at(view.position, view.target, view.up, view.fov_y, view.width, view.height)
+    lamp = replace(scene.light, **light) if light else scene.light
+    return replace(scene, objects=tuple(objects), light=lamp, own_camera=view)
 
 
 def record(scene: PlacedScene, settings: Mapping[str, Any], formats: Iterable[str]) -> dict[str, Any]:
@@ -129,16 +124,14 @@ def _color(values: Any) -> tuple[float, ...]:
 
 
 def _draw(settings: Mapping[str, Any], key: str, count: int, numbers: list[int]) -> Any:
-    """(count, 3) draws; each key has its own stream."""
+    """(count, 3) draws, or (count,) lists of one each; each key has its own stream."""
     ((name, values),) = settings[key].items()
     rng = np.random.default_rng([settings["seed"], _NAMES.index(key), *numbers])
     if name not in (("choice",) if key == "texture" else DISTRIBUTIONS):
         raise ValueError(f"{key}: unknown distribution {name!r}")
-    if key == "texture":
-        if strange := {*values} - {*TEXTURES}:
-            raise ValueError(f"texture: unknown {', '.join(sorted(map(str, strange)))}")
-        return rng.choice(values, size=(count, 3))
-    drawn = getattr(rng, name)(*values, size=(count, 3))
-    if not np.isfinite(drawn).all():
+    if key == "texture" and (strange := {*values} - {*TEXTURES}):
+        raise ValueError(f"texture: unknown {', '.join(sorted(map(str, strange)))}")
+    drawn = rng.choice(values, size=(count, 3)) if key == "texture" else getattr(rng, name)(*values, size=(count, 3))
+    if key != "texture" and not np.isfinite(drawn).all():
         raise InvalidInputError(f"{key}: {name}: {values} draws numbers that are not finite")
-    return drawn
+    return drawn if key in _VECTORS else drawn[:, 0].astype(object)
