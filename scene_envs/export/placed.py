@@ -336,27 +336,6 @@ def visual_mesh(asset: Asset) -> trimesh.Trimesh:
     return joined
 
 
-@dataclass(frozen=True, eq=False)
-class Palette:
-    """The colours of a mesh as a texture with one cell per colour."""
-
-    image: NDArray[np.uint8]  # (H, W, 3) the texture
-    uv: Array  # (K, 2) middle of each cell, v upward
-    cells: NDArray[np.int64]  # (F,) cell of each face
-
-    @classmethod
-    def of(cls, mesh: trimesh.Trimesh) -> Palette:
-        """The palette of a mesh, of at most 1024 colours; if there are more, they are rounded."""
-        colors, cells = np.unique(_few_colors(face_colors(mesh)), axis=0, return_inverse=True)
-        side = int(np.ceil(np.sqrt(len(colors))))
-        pixels = np.zeros((side * side, 3), dtype=np.uint8)
-        pixels[: len(colors)] = colors
-        image = pixels.reshape(side, side, 3).repeat(_CELL, axis=0).repeat(_CELL, axis=1)
-        index = np.arange(len(colors))
-        uv = np.stack([(index % side + 0.5) / side, 1.0 - (index // side + 0.5) / side], axis=1)
-        return cls(image, uv, cells.ravel())
-
-
 @lru_cache(maxsize=64)
 def textured_mesh(asset: Asset, texture: str = "none") -> trimesh.Trimesh:
     """The asset's mesh with one image on a matt material: a palette of its colours, for which corners of several
@@ -366,11 +345,15 @@ def textured_mesh(asset: Asset, texture: str = "none") -> trimesh.Trimesh:
 
     mesh = visual_mesh(asset)
     if texture == "none":
-        palette = Palette.of(mesh)
-        image = palette.image
-        corners = np.stack([mesh.faces, np.repeat(palette.cells[:, None], 3, axis=1)], axis=-1).reshape(-1, 2)
+        colors, cells = np.unique(_few_colors(face_colors(mesh)), axis=0, return_inverse=True)
+        side = int(np.ceil(np.sqrt(len(colors))))
+        pixels = np.zeros((side * side, 3), dtype=np.uint8)
+        pixels[: len(colors)] = colors
+        image = pixels.reshape(side, side, 3).repeat(_CELL, axis=0).repeat(_CELL, axis=1)
+        corners = np.stack([mesh.faces, np.repeat(cells.reshape(-1, 1), 3, axis=1)], axis=-1).reshape(-1, 2)
         unique, faces = np.unique(corners, axis=0, return_inverse=True)
-        vertices, uv = unique[:, 0], palette.uv[unique[:, 1]]
+        vertices, cell = unique.T
+        uv = np.stack([(cell % side + 0.5) / side, 1.0 - (cell // side + 0.5) / side], axis=1)  # v is upward
     else:
         vertices, faces, uv, image = np.arange(len(mesh.vertices)), mesh.faces, pattern_uv(mesh), _pattern(texture)
     material = PBRMaterial(baseColorTexture=Image.fromarray(image), metallicFactor=0.0, roughnessFactor=0.7)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import RECIPES, Asset
@@ -78,9 +79,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
         body = UsdGeom.Xform.Define(stage, f"/World/{item.name}")
         asset_file = files.once(item.asset, "usd", partial(_write_asset, item.asset, files, scene.scene_type))
         body.GetPrim().GetReferences().AddReference(Sdf.Reference(f"./{relative(asset_file, path.parent)}"))
-        body.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*item.translation.tolist()))
-        w, x, y, z = item.quaternion.tolist()
-        body.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
+        _place(body, item.translation, item.quaternion)
         if item.welded:  # MuJoCo and Newton read rigidBodyEnabled=false as a free body
             body.GetPrim().RemoveAPI(UsdPhysics.RigidBodyAPI)
             body.GetPrim().RemoveAPI(UsdPhysics.MassAPI)
@@ -125,13 +124,13 @@ def _add_light(stage: Any, light: Light) -> None:
     from pxr import Gf, UsdGeom, UsdLux
 
     up = np.eye(3)[np.argmin(np.abs(light.direction))]
-    w, *turn = quaternion(camera_axes((0.0, 0.0, 0.0), light.direction, up)).tolist()
     for name, kind in (("lamp", "DistantLight"), ("sky", "DomeLight")):
         lamp = getattr(UsdLux, kind).Define(stage, f"/World/{name}")
         lamp.CreateIntensityAttr(_BRIGHTNESS[kind] * (light.intensity if name == "lamp" else 1.0))
         if name == "lamp":
             lamp.CreateColorAttr(Gf.Vec3f(*linear(light.color).tolist()))
-            UsdGeom.Xformable(lamp).AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, *turn))
+            turn = quaternion(camera_axes((0.0, 0.0, 0.0), light.direction, up))
+            _place(UsdGeom.Xformable(lamp), np.zeros(3), turn)
 
 
 def _add_camera(stage: Any, camera: Camera) -> None:
@@ -142,9 +141,15 @@ def _add_camera(stage: Any, camera: Camera) -> None:
     view.CreateVerticalApertureAttr(height)
     view.CreateFocalLengthAttr(0.5 * height / float(np.tan(np.radians(camera.fov_y) / 2.0)))
     view.CreateClippingRangeAttr(Gf.Vec2f(0.01, 1000.0))
-    view.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*camera.position))
-    w, *turn = quaternion(camera_axes(camera.position, camera.target, camera.up)).tolist()
-    view.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, *turn))
+    _place(view, np.array(camera.position), quaternion(camera_axes(camera.position, camera.target, camera.up)))
+
+
+def _place(prim: Any, translation: Array, turn: Array) -> None:
+    from pxr import Gf, UsdGeom
+
+    prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*translation.tolist()))
+    w, x, y, z = turn.tolist()
+    prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
 
 
 def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder: Path) -> Path:
@@ -179,9 +184,7 @@ def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder:
     colliders.CreatePurposeAttr(UsdGeom.Tokens.guide)
     for index, part in enumerate(asset.fine):
         piece = _define_mesh(stage, f"/{name}/collision/part_{index:02d}", part.vertices, part.faces)
-        corners = part.vertices[part.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        normals, _ = trimesh.triangles.normals(part.vertices[part.faces])
         piece.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
         piece.SetNormalsInterpolation(UsdGeom.Tokens.uniform)
         piece.CreateDisplayColorAttr([Gf.Vec3f(0.4, 0.7, 0.4)])
