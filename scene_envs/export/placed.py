@@ -239,14 +239,14 @@ def angle_axis(rotation: Array) -> tuple[float, Array]:
     return float(np.degrees(angle)), vector / angle if angle else np.array([0.0, 0.0, 1.0])
 
 
-def camera_axes(position: Sequence[float], target: Sequence[float], up: Sequence[float]) -> Array:
-    """(3, 3): columns right, up and backward of a camera at ``position`` that looks at ``target``, as OpenGL has them.
+def camera_axes(position: Any, target: Any, up: Any) -> Array:
+    """(3, 3): columns right, up and backward of a camera at ``position`` (3,) that looks at ``target`` (3,), as OpenGL
+    has them; ``up`` (3,).
 
     >>> camera_axes((0.0, 0.0, 2.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    x, y, z = (tuple(map(float, vector)) for vector in (position, target, up))
-    return Pinhole.at(x, y, z, 45.0, 1, 1).pose[:3, :3] * [1.0, -1.0, -1.0] + 0.0  # type: ignore[arg-type]
+    return Pinhole.at(position, target, up, 45.0, 1, 1).pose[:3, :3] * [1.0, -1.0, -1.0] + 0.0
 
 
 def number(value: float) -> str:
@@ -418,7 +418,7 @@ def _write_visual(mesh: trimesh.Trimesh, path: Path) -> Path:
     material = SimpleMaterial(visual.material.baseColorTexture, white, white, [0, 0, 0, 255], name=path.name)
     shown.visual = trimesh.visual.TextureVisuals(visual.uv, material)
     mtl = f"{path.name}.mtl"
-    text, others = export_obj(shown, include_normals=True, return_texture=True, mtl_name=mtl, header=None)
+    text, others = export_obj(shown, include_normals=True, return_texture=True, mtl_name=mtl, header=None, digits=7)
     for name, data in {**others, f"{path.name}.obj": text.encode()}.items():
         path.with_name(name).write_bytes(data)
     return path.with_suffix(".obj")

@@ -51,7 +51,7 @@ _QCODES = {
 }  # fmt: skip
 """Wikidata items by a word of the asset's name."""
 _PHYSICAL_OBJECT = "Q223557"
-_BRIGHTNESS = {"DistantLight": 1000.0, "DomeLight": 300.0}
+_LAMP, _SKY = 1000.0, 300.0
 """Intensities (nit) of the lamp, and of the light from all sides that is with it."""
 _THUMBNAIL = 256
 """Width and height of an asset's picture, pixels."""
@@ -124,13 +124,11 @@ def _add_light(stage: Any, light: Light) -> None:
     from pxr import Gf, UsdGeom, UsdLux
 
     up = np.eye(3)[np.argmin(np.abs(light.direction))]
-    for name, kind in (("lamp", "DistantLight"), ("sky", "DomeLight")):
-        lamp = getattr(UsdLux, kind).Define(stage, f"/World/{name}")
-        lamp.CreateIntensityAttr(_BRIGHTNESS[kind] * (light.intensity if name == "lamp" else 1.0))
-        if name == "lamp":
-            lamp.CreateColorAttr(Gf.Vec3f(*linear(light.color).tolist()))
-            turn = quaternion(camera_axes((0.0, 0.0, 0.0), light.direction, up))
-            _place(UsdGeom.Xformable(lamp), np.zeros(3), turn)
+    lamp = UsdLux.DistantLight.Define(stage, "/World/lamp")
+    lamp.CreateIntensityAttr(_LAMP * light.intensity)
+    lamp.CreateColorAttr(Gf.Vec3f(*linear(light.color).tolist()))
+    _place(UsdGeom.Xformable(lamp), np.zeros(3), quaternion(camera_axes(np.zeros(3), light.direction, up)))
+    UsdLux.DomeLight.Define(stage, "/World/sky").CreateIntensityAttr(_SKY)
 
 
 def _add_camera(stage: Any, camera: Camera) -> None:
@@ -184,7 +182,7 @@ def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder:
     colliders.CreatePurposeAttr(UsdGeom.Tokens.guide)
     for index, part in enumerate(asset.fine):
         piece = _define_mesh(stage, f"/{name}/collision/part_{index:02d}", part.vertices, part.faces)
-        normals, _ = trimesh.triangles.normals(part.vertices[part.faces])
+        normals = trimesh.Trimesh(part.vertices, part.faces, process=False).face_normals
         piece.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
         piece.SetNormalsInterpolation(UsdGeom.Tokens.uniform)
         piece.CreateDisplayColorAttr([Gf.Vec3f(0.4, 0.7, 0.4)])

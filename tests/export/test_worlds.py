@@ -17,7 +17,7 @@ from agents.cli import main
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.export import export, list_formats, place, worlds
-from scene_envs.export.formats import check_formats
+from scene_envs.export.formats import resolve_formats
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 from tests.helpers.examples import load_example
@@ -244,7 +244,7 @@ def test_a_mass_of_its_own_is_that_of_the_world(tmp_path, example):
 
 def test_impossible_worlds_are_refused(tmp_path, monkeypatch):
     assert "worlds" in list_formats()
-    assert "worlds" not in check_formats("all")  # those have a file for each scene
+    assert "worlds" not in resolve_formats("all")  # those have a file for each scene
     with pytest.raises(InvalidInputError, match="worlds of 0 scenes without objects"):
         export(SceneBatch(torch.zeros(0, 3, DIMSUM.features), DIMSUM), tmp_path / "none", "worlds")
     empty = torch.zeros(2, 3, DIMSUM.features)

@@ -54,11 +54,11 @@ class SampleConfig(PromptKeys, SamplingKeys, DrawKeys, RewardLimitKeys, OutputKe
 
 def check(settings: SampleConfig) -> None:
     """Refuse impossible settings before a prior is loaded."""
-    from scene_envs.export.formats import check_formats
+    from scene_envs.export.formats import resolve_formats
     from scene_envs.export.randomization import read_randomization
 
     if settings.export is not None:
-        check_formats(settings.export)
+        resolve_formats(settings.export)
     if read_randomization(settings.randomization) and settings.export is None:
         raise InvalidInputError("randomization= changes exported scenes; add export=, as export=mjcf")
     if settings.verify and not (settings.project and settings.export is not None):
