@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +76,11 @@ def export(
     names = resolve_formats(formats)
     writers = {name: _FORMATS[name].writer() for name in names}
     settings = read_randomization(randomization)
-    placed = [randomize(scene, settings) for scene in place(batch, friction)]
+    seen: Counter[bytes] = Counter()
+    placed = []
+    for scene in place(batch, friction):
+        placed.append(randomize(scene, settings, seen[scene.digest]))
+        seen[scene.digest] += 1
     root = Path(output)
     manifest = _claim(root, batch, friction, settings)
     package = f"{identifier(batch.scene_type.name)}_{manifest['digest'][:8]}"

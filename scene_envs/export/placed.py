@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -127,6 +128,11 @@ class PlacedScene:
     objects: tuple[PlacedObject, ...]
     light: Light = Light()
     own_camera: Camera | None = None
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Digest (32 bytes) of the poses."""
+        return hashlib.sha256(b"".join(item.matrix.tobytes() for item in self.objects)).digest()
 
     @property
     def camera(self) -> Camera:

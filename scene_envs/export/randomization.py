@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping
@@ -69,13 +68,13 @@ def read_randomization(source: str | os.PathLike[str] | Mapping[str, Any]) -> di
     return settings
 
 
-def randomize(scene: PlacedScene, settings: Mapping[str, Any]) -> PlacedScene:
-    """The scene with drawn values. They depend on the seed, the key and the poses of the scene, on no other scene.
+def randomize(scene: PlacedScene, settings: Mapping[str, Any], repeat: int = 0) -> PlacedScene:
+    """The scene with drawn values. They depend on the seed, the key, the poses of the scene, and on how many scenes of
+    these poses come before it (``repeat``); on no other scene.
 
     Raises InvalidInputError for a mass, friction or intensity that is not positive, and for a camera that cannot be.
     """
-    poses = b"".join(item.matrix.tobytes() for item in scene.objects)
-    numbers = np.frombuffer(hashlib.sha256(poses).digest(), dtype=np.uint32).tolist()
+    numbers = np.frombuffer(scene.digest, dtype=np.uint32).tolist() + [repeat] * (repeat > 0)
     count = len(scene.objects)
     draws = {key: _draw(settings, key, 1 if "_" in key else count, numbers) for key in settings.keys() - {"seed"}}
     for key in draws.keys() & {*PHYSICS, "light_intensity"}:

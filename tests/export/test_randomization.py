@@ -166,6 +166,17 @@ def test_looks_are_those_of_their_distributions_and_of_the_scene_alone():
     assert (plain.light, plain.camera) == (place(laid_scene())[0].light, nominal)
 
 
+def test_a_scene_that_repeats_looks_different_each_time(tmp_path):
+    batch = SceneBatch.concatenate([laid_scene(), jittered_scene(3), laid_scene()])
+    export(batch, tmp_path / "three", "npz", randomization=LOOKS)
+    export(batch[[1, 2, 0]], tmp_path / "turned", "npz", randomization=LOOKS)
+    names = ("scene_000", "scene_001", "scene_002")
+    first, other, again = (said(tmp_path / "three", name) for name in names)
+    assert [said(tmp_path / "turned", name) for name in names] == [other, first, again]
+    assert first["camera"] != again["camera"]
+    assert first["objects"]["teacup_0"]["color"] != again["objects"]["teacup_0"]["color"]
+
+
 def test_mujoco_reads_the_looks_and_physics_stays_bit_for_bit(tmp_path):
     models = []
     for name, settings in (("plain", {}), ("looks", LOOKS)):
