@@ -70,14 +70,14 @@ def new_model(
     axes = numbers(camera_axes(camera.position, camera.target, camera.up)[:, :2].T)
     place = {"pos": numbers(camera.position), "xyaxes": axes, "fovy": number(camera.fov_y)}
     ET.SubElement(world, "camera", place, name="scene")
-    looks = dict(sorted({(item.category, item.texture): item for item in objects}.items())).values()
-    for item in looks:
-        name, visual = files.look(item), files.visual(item.asset, item.texture)
+    looks = {files.look(item): item for item in sorted(objects, key=lambda item: (item.category, item.texture))}
+    for name, item in looks.items():
+        visual = files.visual(item.asset, item.texture)
         file = relative(visual.with_suffix(".png"), files.root)
         ET.SubElement(shared, "texture", name=name, type="2d", file=file)
         ET.SubElement(shared, "material", name=name, texture=name, specular="0.2")
         ET.SubElement(shared, "mesh", name=f"{name}_visual", file=relative(visual, files.root), inertia="shell")
-    for asset in dict.fromkeys(item.asset for item in looks):
+    for asset in dict.fromkeys(item.asset for item in looks.values()):
         for part in files.parts(asset):
             ET.SubElement(shared, "mesh", name=f"{files.name(asset)}_{part.stem}", file=relative(part, files.root))
     return root, world

@@ -79,7 +79,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
         body = UsdGeom.Xform.Define(stage, f"/World/{item.name}")
         asset_file = files.once(item.asset, "usd", partial(_write_asset, item.asset, files, scene.scene_type))
         body.GetPrim().GetReferences().AddReference(Sdf.Reference(f"./{relative(asset_file, path.parent)}"))
-        _place(body, item.translation, item.quaternion)
+        _place(body, item.matrix)
         if item.welded:  # MuJoCo and Newton read rigidBodyEnabled=false as a free body
             body.GetPrim().RemoveAPI(UsdPhysics.RigidBodyAPI)
             body.GetPrim().RemoveAPI(UsdPhysics.MassAPI)
@@ -90,7 +90,7 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
             surface.CreateStaticFrictionAttr(item.friction)
             surface.CreateDynamicFrictionAttr(item.friction)
         if item.tinted or item.texture != "none":
-            _change_look(stage, item, files, path.parent)
+            _change_look(stage, f"/World/{item.name}", item, files, path.parent)
     if scene.light != Light():
         _add_light(stage, scene.light)
     if scene.camera != scene.scene_type.camera:
@@ -99,11 +99,10 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     return path
 
 
-def _change_look(stage: Any, item: PlacedObject, files: AssetFiles, folder: Path) -> None:
+def _change_look(stage: Any, prim: str, item: PlacedObject, files: AssetFiles, folder: Path) -> None:
     """The object's texture and colour over those of its asset: a palette without, and an image with a texture."""
     from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
 
-    prim = f"/World/{item.name}"
     if item.texture == "none":
         palette = np.unique(face_colors(visual_mesh(item.asset)), axis=0) / 255.0
         colors = Vt.Vec3fArray.FromNumpy(linear(palette * item.color).astype(np.float32))
@@ -121,13 +120,15 @@ def _change_look(stage: Any, item: PlacedObject, files: AssetFiles, folder: Path
 
 
 def _add_light(stage: Any, light: Light) -> None:
-    from pxr import Gf, UsdGeom, UsdLux
+    from pxr import Gf, UsdLux
 
     up = np.eye(3)[np.argmin(np.abs(light.direction))]
     lamp = UsdLux.DistantLight.Define(stage, "/World/lamp")
     lamp.CreateIntensityAttr(_LAMP * light.intensity)
     lamp.CreateColorAttr(Gf.Vec3f(*linear(light.color).tolist()))
-    _place(UsdGeom.Xformable(lamp), np.zeros(3), quaternion(camera_axes(np.zeros(3), light.direction, up)))
+    pose = np.eye(4)
+    pose[:3, :3] = camera_axes(np.zeros(3), light.direction, up)
+    _place(lamp, pose)
     UsdLux.DomeLight.Define(stage, "/World/sky").CreateIntensityAttr(_SKY)
 
 
@@ -139,15 +140,17 @@ def _add_camera(stage: Any, camera: Camera) -> None:
     view.CreateVerticalApertureAttr(height)
     view.CreateFocalLengthAttr(0.5 * height / float(np.tan(np.radians(camera.fov_y) / 2.0)))
     view.CreateClippingRangeAttr(Gf.Vec2f(0.01, 1000.0))
-    _place(view, np.array(camera.position), quaternion(camera_axes(camera.position, camera.target, camera.up)))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = camera_axes(camera.position, camera.target, camera.up), camera.position
+    _place(view, pose)
 
 
-def _place(prim: Any, translation: Array, turn: Array) -> None:
+def _place(prim: Any, pose: Array) -> None:
+    """Put a prim at a pose (4, 4) in the frame of the prim above it."""
     from pxr import Gf, UsdGeom
 
-    prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*translation.tolist()))
-    w, x, y, z = turn.tolist()
-    prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
+    prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*pose[:3, 3].tolist()))
+    prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(*quaternion(pose[:3, :3]).tolist()))
 
 
 def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder: Path) -> Path:
