@@ -11,15 +11,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from scene_envs.assets.base import identifier
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.export.formats import _FORMATS, resolve_formats
-from scene_envs.export.placed import AssetFiles, identifier, place
+from scene_envs.export.placed import AssetFiles, PlacedObject, place
 from scene_envs.export.randomization import randomize, read_randomization, record
 from scene_envs.files import write_json
 from scene_envs.physics.parts import FRICTION
 from scene_envs.scene import SceneBatch
 
 MANIFEST = "export.json"
+_WITH_JOINTS = ("urdf", "sdf", "drake", "mjcf", "usd")
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class ExportReport:
         scenes: Main file of each format, for each scene.
         assets: Names of the assets in use.
         size: Size of the whole export, bytes.
+        notes: For each asset with joints, the formats in which they move and those in which they are frozen.
     """
 
     output: Path
@@ -39,6 +42,7 @@ class ExportReport:
     scenes: tuple[Mapping[str, Path], ...]
     assets: tuple[str, ...]
     size: int
+    notes: tuple[str, ...] = ()
 
 
 def export(
@@ -103,7 +107,17 @@ def export(
         path for top in ("worlds.*", "assets/**/*", "scene_[0-9]*", "scene_[0-9]*/**/*") for path in root.glob(top)
     ]
     size = sum(path.stat().st_size for path in written if path.is_file())
-    return ExportReport(root, names, tuple(scenes), used, size)
+    jointed = {item.asset.name: item for scene in placed for item in scene.objects if item.asset.joints}
+    notes = tuple(_joints_in(names, item) for item in jointed.values())
+    return ExportReport(root, names, tuple(scenes), used, size, notes)
+
+
+def _joints_in(formats: Sequence[str], item: PlacedObject) -> str:
+    moving = [name for name in formats if name in _WITH_JOINTS and item.joints]
+    frozen = [name for name in formats if name not in moving]
+    verbs = [f"{verb} in {', '.join(some)}" for verb, some in (("move", moving), ("are frozen", frozen)) if some]
+    free = "" if item.joints else ", because it is not welded"
+    return f"{item.asset.name}: its joints ({', '.join(j.name for j in item.asset.joints)}) {' and '.join(verbs)}{free}"
 
 
 def scene_folders(count: int) -> tuple[str, ...]:
@@ -162,4 +176,5 @@ def _digest(batch: SceneBatch) -> str:
         digest.update(asset.inertia.tobytes() + asset.center_of_mass.tobytes())
         for part in asset.fine:
             digest.update(part.vertices.tobytes())
+        digest.update(repr(asset.joints).encode() if asset.joints else b"")
     return digest.hexdigest()[:16]

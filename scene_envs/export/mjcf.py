@@ -9,6 +9,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from scene_envs.arrays import Array
+from scene_envs.assets.base import Joint
 from scene_envs.export.placed import (
     AssetFiles,
     Light,
@@ -25,10 +26,18 @@ from scene_envs.physics.parts import principal_inertia
 
 
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
-    """``scene.xml``: one body per object, with a free joint of the same name unless it is welded."""
-    root, world = new_model(f"{scene.scene_type.name}_{scene.index}", scene, scene.objects, files, folder)
+    """``scene.xml``: one body per object, with a free joint of the same name unless it is welded. The links of a welded
+    object are bodies in it, with their joints; they do not touch what they hang on.
+    """
+    pieces = [piece for item in scene.objects for piece in item.pieces]
+    root, world = new_model(f"{scene.scene_type.name}_{scene.index}", scene, pieces, files, folder)
     for item in scene.objects:
-        _add_body(root, world, item, files)
+        bodies = [_add_body(root, world, item.pieces[0], files)]
+        for joint, link in zip(item.joints, item.pieces[1:], strict=True):
+            bodies.append(_add_body(root, bodies[joint.parent], link, files, joint))
+            pair = {"body1": bodies[joint.parent].get("name", ""), "body2": link.name}
+            contact = root.find("contact")
+            ET.SubElement(ET.SubElement(root, "contact") if contact is None else contact, "exclude", pair)
     return write_xml(root, folder / "scene.xml")
 
 
@@ -88,11 +97,20 @@ def diffuse(light: Light) -> Array:
     return 0.3 * light.intensity * np.array(light.color)
 
 
-def _add_body(root: ET.Element, world: ET.Element, item: PlacedObject, files: AssetFiles) -> None:
+def _add_body(
+    root: ET.Element, world: ET.Element, item: PlacedObject, files: AssetFiles, joint: Joint | None = None
+) -> ET.Element:
     asset, name = item.asset, files.name(item.asset)
     body = ET.SubElement(world, "body", name=item.name, pos=numbers(item.translation), quat=numbers(item.quaternion))
     if not item.welded:
-        ET.SubElement(body, "freejoint", name=item.name)
+        if joint is None:
+            ET.SubElement(body, "freejoint", name=item.name)
+        else:
+            named = {"name": f"{item.name.partition('/')[0]}/{joint.name}", "axis": numbers(joint.axis)}
+            way = {"range": numbers(joint.limits)} if np.isfinite(joint.limits[0]) else {"limited": "false"}
+            rubs = {"damping": number(joint.damping), "frictionloss": number(joint.friction)}
+            kind = "slide" if joint.kind == "prismatic" else "hinge"
+            ET.SubElement(body, "joint", {**named, "type": kind, **way, **rubs})
         moments, axes = principal_inertia(item.inertia)
         place = {"pos": numbers(asset.center_of_mass), "quat": numbers(quaternion(axes))}
         ET.SubElement(body, "inertial", place, mass=number(item.mass), diaginertia=numbers(moments))
@@ -105,3 +123,4 @@ def _add_body(root: ET.Element, world: ET.Element, item: PlacedObject, files: As
     own = {} if item.friction == files.friction else {"friction": f"{number(item.friction)} 0.005 0.0001"}
     for part in files.parts(asset):
         ET.SubElement(body, "geom", {"class": "collision", "mesh": f"{name}_{part.stem}", **own})
+    return body

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,7 @@ from trimesh.exchange.obj import export_obj
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from scene_envs.arrays import Array
-from scene_envs.assets.base import Asset, ConvexPart
+from scene_envs.assets.base import Asset, ConvexPart, Joint, identifiers
 from scene_envs.assets.shapes import convex_hull
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics.parts import FRICTION, quaternions
@@ -108,6 +107,32 @@ class PlacedObject:
         matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
         return matrix
 
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """The joints that move while the object stays where it is; none of a free object."""
+        return self.asset.joints if self.welded else ()
+
+    @cached_property
+    def pieces(self) -> tuple[PlacedObject, ...]:
+        """What does not move, at the pose of the object, and then the link of each joint, called ``cabinet_0/door``, at
+        its pose in the frame of its parent; the object itself where it has no joints.
+        """
+        if not self.joints:
+            return (self,)
+        found = [replace(self, asset=b, mass=b.mass, inertia=b.inertia) for b in self.asset.bodies]
+        for row, joint in enumerate(self.joints, start=1):
+            place = {"translation": joint.pose[:3, 3], "rotation": joint.pose[:3, :3]}
+            found[row] = replace(found[row], name=f"{self.name}/{joint.link}", welded=False, **place)
+        return tuple(found)
+
+    @cached_property
+    def frames(self) -> list[Array]:
+        """(4, 4) of each piece in the frame of the object."""
+        found = [np.eye(4)]
+        for joint in self.joints:
+            found.append(found[joint.parent] @ joint.pose)
+        return found
+
 
 @dataclass(frozen=True, eq=False)
 class PlacedScene:
@@ -144,6 +169,12 @@ class PlacedScene:
         """The assets in use, each once, in category order."""
         used = {item.category: item.asset for item in self.objects}
         return tuple(used[category] for category in sorted(used))
+
+    @property
+    def bodies(self) -> tuple[Asset, ...]:
+        """As ``assets``, with the bodies of those whose joints move in their place."""
+        used = {item.category: [piece.asset for piece in item.pieces] for item in self.objects}
+        return tuple(asset for category in sorted(used) for asset in used[category])
 
 
 def place(batch: SceneBatch, friction: float = FRICTION) -> list[PlacedScene]:
@@ -193,28 +224,6 @@ def place(batch: SceneBatch, friction: float = FRICTION) -> list[PlacedScene]:
             seen[category] += 1
         scenes.append(PlacedScene(index, scene_type, len(categories), tuple(objects)))
     return scenes
-
-
-def identifiers(names: Iterable[str]) -> dict[str, str]:
-    """For each name, a unique identifier of letters, digits and underscores that does not start with a digit.
-
-    >>> identifiers(["tea cup", "tea-cup", "7up", "plate"])
-    {'tea cup': 'tea_cup', 'tea-cup': 'tea_cup_2', '7up': '_7up', 'plate': 'plate'}
-    """
-    found: dict[str, str] = {}
-    for name in names:
-        free, repeat = identifier(name), 1
-        while free in found.values():
-            repeat += 1
-            free = f"{identifier(name)}_{repeat}"
-        found[name] = free
-    return found
-
-
-def identifier(name: str) -> str:
-    """``name`` with everything but letters, digits and underscores replaced; it does not start with a digit."""
-    plain = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
-    return f"_{plain}" if plain[0].isdigit() else plain
 
 
 def exact_rotations(matrices: NDArray[np.floating]) -> Array:
@@ -283,7 +292,7 @@ class AssetFiles:
         self.root = folder
         self.friction = friction
         self.package = package
-        self._names = identifiers(asset.name for asset in assets)
+        self._names = identifiers(one.name for many in (assets, *(a.bodies for a in assets)) for one in many)
         self._done: dict[tuple[str, str], Any] = {}
 
     def name(self, asset: Asset) -> str:

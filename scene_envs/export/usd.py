@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import RECIPES, Asset
@@ -60,7 +61,8 @@ _THUMBNAIL = 256
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene_000.usda`` beside the folder ``assets``, so that every reference stays below the file's own folder.
 
-    One prim under ``/World`` per object; welded ones are colliders without a rigid body; units m and kg, z up. A light
+    One prim under ``/World`` per object; welded ones are colliders without a rigid body; units m and kg, z up. With
+    joints, the prim is an articulation of a prim for each link, and a fixed joint holds the first at the world. A light
     or a camera that was drawn for the scene is ``/World/lamp``, with ``/World/sky``, or ``/World/camera``.
     """
     from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics
@@ -76,21 +78,28 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     _apply(physics, "MjcSceneAPI", _SCENE)
     _apply(physics, "NewtonSceneAPI", {"newton:timeStepsPerSecond": ("int", round(1.0 / TIMESTEP))})
     for item in scene.objects:
-        body = UsdGeom.Xform.Define(stage, f"/World/{item.name}")
-        asset_file = files.once(item.asset, "usd", partial(_write_asset, item.asset, files, scene.scene_type))
-        body.GetPrim().GetReferences().AddReference(Sdf.Reference(f"./{relative(asset_file, path.parent)}"))
-        _place(body, item.matrix)
-        if item.welded:  # MuJoCo and Newton read rigidBodyEnabled=false as a free body
-            body.GetPrim().RemoveAPI(UsdPhysics.RigidBodyAPI)
-            body.GetPrim().RemoveAPI(UsdPhysics.MassAPI)
-        elif item.mass != item.asset.mass:
-            _apply_body(body.GetPrim(), replace(item.asset, mass=item.mass, inertia=item.inertia))
-        if item.friction != files.friction:
-            surface = UsdPhysics.MaterialAPI.Apply(stage.OverridePrim(f"/World/{item.name}/surface"))
-            surface.CreateStaticFrictionAttr(item.friction)
-            surface.CreateDynamicFrictionAttr(item.friction)
-        if item.tinted or item.texture != "none":
-            _change_look(stage, f"/World/{item.name}", item, files, path.parent)
+        prims = [_place(UsdGeom.Xform.Define(stage, f"/World/{item.name}"), item.matrix)]
+        if item.joints:
+            names = [files.name(item.asset), *(joint.link for joint in item.joints)]
+            prims = [
+                _place(UsdGeom.Xform.Define(stage, f"/World/{item.name}/{name}"), frame)
+                for name, frame in zip(names, item.frames, strict=True)
+            ]
+            _add_joints(stage, item, [prim.GetPath() for prim in prims])
+        for prim, piece in zip(prims, item.pieces, strict=True):
+            asset_file = files.once(piece.asset, "usd", partial(_write_asset, piece.asset, files, scene.scene_type))
+            prim.GetReferences().AddReference(Sdf.Reference(f"./{relative(asset_file, path.parent)}"))
+            if item.welded and not item.joints:  # MuJoCo and Newton read rigidBodyEnabled=false as a free body
+                prim.RemoveAPI(UsdPhysics.RigidBodyAPI)
+                prim.RemoveAPI(UsdPhysics.MassAPI)
+            elif piece.mass != piece.asset.mass:
+                _apply_body(prim, replace(piece.asset, mass=piece.mass, inertia=piece.inertia))
+            if item.friction != files.friction:
+                surface = UsdPhysics.MaterialAPI.Apply(stage.OverridePrim(prim.GetPath().AppendChild("surface")))
+                surface.CreateStaticFrictionAttr(item.friction)
+                surface.CreateDynamicFrictionAttr(item.friction)
+            if piece.tinted or piece.texture != "none":
+                _change_look(stage, str(prim.GetPath()), piece, files, path.parent)
     if scene.light != Light():
         _add_light(stage, scene.light)
     if scene.camera != scene.scene_type.camera:
@@ -145,12 +154,44 @@ def _add_camera(stage: Any, camera: Camera) -> None:
     _place(view, pose)
 
 
-def _place(prim: Any, pose: Array) -> None:
-    """Put a prim at a pose (4, 4) in the frame of the prim above it."""
+def _place(prim: Any, pose: Array) -> Any:
+    """The prim, put at a pose (4, 4) in the frame of the prim above it."""
     from pxr import Gf, UsdGeom
 
     prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*pose[:3, 3].tolist()))
     prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(*quaternion(pose[:3, :3]).tolist()))
+    return prim.GetPrim()
+
+
+def _add_joints(stage: Any, item: PlacedObject, paths: list[Any]) -> None:
+    """The joints of the links at these paths, below the object, and one that holds the first at the world."""
+    from pxr import Gf, Sdf, UsdGeom, UsdPhysics
+
+    UsdPhysics.ArticulationRootAPI.Apply(stage.GetPrimAtPath(paths[0]))  # MuJoCo takes a prim of no link for a body
+    folder = UsdGeom.Scope.Define(stage, f"/World/{item.name}/joints").GetPath()
+    weld = UsdPhysics.FixedJoint.Define(stage, folder.AppendChild(f"{paths[0].name}_weld"))
+    made: list[tuple[Any, list[Any], Array, Array]] = [(weld, paths[:1], item.matrix, np.eye(4))]
+    for path, joint in zip(paths[1:], item.joints, strict=True):
+        is_slide = joint.kind == "prismatic"
+        kind = UsdPhysics.PrismaticJoint if is_slide else UsdPhysics.RevoluteJoint
+        found = kind.Define(stage, folder.AppendChild(joint.name))
+        turn = np.eye(4)  # from the x axis to that of the joint
+        turn[:3, :3] = Rotation.align_vectors(joint.axis, (1.0, 0.0, 0.0))[0].as_matrix()
+        made.append((found, [paths[joint.parent], path], joint.pose @ turn, turn))
+        degrees = 1.0 if is_slide else np.degrees(1.0)
+        found.CreateAxisAttr(UsdPhysics.Tokens.x)
+        found.CreateLowerLimitAttr(joint.limits[0] * degrees)
+        found.CreateUpperLimitAttr(joint.limits[1] * degrees)
+        found.GetPrim().AddAppliedSchema("NewtonJointAPI")  # MuJoCo reads it as well
+        for key, value in (("damping", joint.damping / degrees), ("friction", joint.friction)):
+            found.GetPrim().CreateAttribute(f"newton:{key}", Sdf.ValueTypeNames.Float, False).Set(value)
+    for found, ends, *frames in made:
+        for end, relation in zip(reversed(ends), (found.CreateBody1Rel(), found.CreateBody0Rel()), strict=False):
+            relation.SetTargets([end])
+        for index, frame in enumerate(frames):
+            place, axes = Gf.Vec3f(*frame[:3, 3].tolist()), Gf.Quatf(*quaternion(frame[:3, :3]).tolist())
+            found.GetPrim().GetAttribute(f"physics:localPos{index}").Set(place)
+            found.GetPrim().GetAttribute(f"physics:localRot{index}").Set(axes)
 
 
 def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder: Path) -> Path:
@@ -198,7 +239,8 @@ def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder:
         binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
     stage.GetRootLayer().customLayerData = _metadata(asset, code)
     stage.GetRootLayer().Save()
-    _write_thumbnail(asset, scene_type, path.parent / ".thumbs" / "256x256" / f"{path.name}.png")
+    if asset.name in scene_type.library.names:
+        _write_thumbnail(asset, scene_type, path.parent / ".thumbs" / "256x256" / f"{path.name}.png")
     return path
 
 

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from agents.cli import main
 from agents.priors import ScenePrior
 from agents.priors.testing import tiny_prior
+from scene_envs.assets.base import identifiers
 from scene_envs.datasets import SceneDataset
 from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
 from scene_envs.export import AssetFiles, export, formats, list_formats, register_format
@@ -26,12 +27,11 @@ from scene_envs.export.placed import (
     angle_axis,
     exact_rotations,
     face_colors,
-    identifiers,
     quaternion,
     textured_mesh,
     visual_mesh,
 )
-from scene_envs.export.sdf import roll_pitch_yaw
+from scene_envs.export.urdf import roll_pitch_yaw
 from scene_envs.normalizer import Normalizer
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch

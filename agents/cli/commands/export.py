@@ -118,6 +118,8 @@ def export_scenes(
     seconds = time.perf_counter() - started
     size = f"{report.size / 1e6:.1f} MB"
     run.say(f"{len(batch)} scenes as {', '.join(report.formats)} in {output}: {size}, {seconds:.1f} s")
+    for note in report.notes:
+        run.say(note)
     overlapping = int((penetration(batch, pool=pool).depth.amax(dim=1) > _OVERLAP).sum()) if len(batch) else 0
     if overlapping:
         run.say(

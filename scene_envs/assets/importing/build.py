@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from scene_envs.arrays import Array
-from scene_envs.assets.base import Asset, ConvexPart, bounds_of, regular_plural
+from scene_envs.assets.base import Asset, ConvexPart, Joint, bounds_of, identifier, identifiers, regular_plural
 from scene_envs.assets.importing.limits import seconds_left
 from scene_envs.assets.importing.mesh_files import (
     MESH_SUFFIXES,
@@ -25,6 +25,7 @@ from scene_envs.assets.importing.mesh_files import (
     Shape,
     heavier,
     merged_inertial,
+    moved_inertial,
     pose_of,
 )
 from scene_envs.assets.importing.robot_files import read_mjcf, read_sdf, read_urdf, read_usd
@@ -234,7 +235,10 @@ def weigh(
     wrong = why_impossible(inertia, given.center_of_mass, parts, even)
     if wrong:
         return Weight(even, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
-    return Weight(MassProperties(mass, given.center_of_mass, 0.5 * (inertia + inertia.T)), notes, ())
+    inertia = 0.5 * (inertia + inertia.T)
+    low, middle, high = np.linalg.eigvalsh(inertia)
+    inertia += max(0.0, high * (1.0 + 1e-9) - low - middle) * np.eye(3)  # MuJoCo refuses a plate by a rounding
+    return Weight(MassProperties(mass, given.center_of_mass, inertia), notes, ())
 
 
 def why_impossible(inertia: Array, center: Array, parts: Sequence[ConvexPart], computed: MassProperties) -> str:
@@ -340,17 +344,21 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     size = _diagonal(shapes)
     if not _SMALL <= size <= _LARGE:
         warnings.append(f"it is {size:.3g} m large; if the file is not in metres, set `scale`")
-    parts, solid = _collide(shapes, entry, size, path, notes, warnings)
+    pieces = _collide(shapes, entry, size, path, notes, warnings)
+    parts, solid = [part for piece in pieces for part in piece.parts], merged_inertial([p.solid for p in pieces])
     static = model.static is True if entry.welded is None else entry.welded
     if entry.welded is None and (entry.mass is not None or entry.density is not None):
         static = False
-    given = merged_inertial(model.inertials) if model.inertials else None
-    weight = weigh(given, parts, solid, entry)
+    if static and model.faults:
+        raise CorruptFileError("; ".join(model.faults))
+    notes += model.faults
+    weight = weigh(_given(model, {}), parts, solid, entry)
     properties = mass_properties(parts, 0.0) if static else weight.properties
     if not static:
         notes += weight.notes
         warnings += weight.warnings
-    visual = join(*(mesh for shape in model.visuals or shapes for mesh in visual_of(shape, entry.color)))
+    drawn = [(shape.link, visual_of(shape, entry.color)) for shape in model.visuals or shapes]
+    visual = join(*(mesh for _, meshes in drawn for mesh in meshes))
     meshes = [shape for shape in (*model.visuals, *shapes) if shape.kind == "mesh"]
     notes += dict.fromkeys(
         note for shape in meshes for mesh in meshes_of(shape) for note in mesh.metadata.get("notes", ())
@@ -362,6 +370,10 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     fine = tuple(_shifted(part, shift) for part in parts)
     if len(visual.faces) > _MANY_TRIANGLES:
         notes.append(f"{len(visual.faces)} triangles to draw; pictures will be slow")
+    joints, bodies = _articulate(model, pieces, drawn, entry, shift, notes, warnings if static else [])
+    if joints:
+        where = "frozen at zero, and kept in exports" if static else "frozen at zero"
+        notes.append(f"movable joints {where}: {', '.join(joint.name for joint in joints)}")
     asset = Asset(
         name=entry.name,
         display_name=entry.display_name,
@@ -374,11 +386,72 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
         coarse=fine if len(fine) == 1 else (enclosing_hull(fine),),
         color=entry.color or (128, 128, 128),
         static=static,
+        joints=joints,
+        bodies=bodies,
     )
     x, y, z = (shift + 0.0).tolist()
     density = 0.0 if static else properties.mass / solid.mass
     remarks = tuple(notes), tuple(warnings)
     return asset, AssetReport(entry.name, path, properties.mass, density, len(fine), (x, y, z), *remarks)
+
+
+def _given(model: Model, rows: Mapping[int, int], row: int = 0) -> MassProperties | None:
+    """What the file gives for the body that has this row, by the joints of its links; by default all is one body."""
+    own = [inertial for link, inertial in model.inertials if rows.get(link, 0) == row]
+    return merged_inertial(own) if own else None
+
+
+def _articulate(
+    model: Model,
+    pieces: Sequence[_Piece],
+    drawn: Sequence[tuple[int, list[trimesh.Trimesh]]],
+    entry: AssetEntry,
+    shift: Array,
+    notes: list[str],
+    warnings: list[str],
+) -> tuple[tuple[Joint, ...], tuple[Asset, ...]]:
+    """The joints whose links can be seen and touched, and the bodies that they connect; other links stay with what they
+    hang on.
+    """
+    solid = {piece.link for piece in pieces} & {link for link, _ in drawn}
+    rows, kept, has_base = {0: 0}, list[int](), 0 in solid
+    for index, joint in enumerate(model.joints, start=1):
+        rows[index] = parent = rows[joint.parent]
+        if index in solid and (parent or has_base):
+            kept.append(index)
+            rows[index] = len(kept)
+        else:
+            has_base |= index in solid
+            notes.append(f"movable joint frozen at zero: {joint.name} (it joins what has no shape)")
+    if not kept:
+        return (), ()
+    names = identifiers(model.joints[index - 1].link for index in kept)
+    titles = identifiers(model.joints[index - 1].name for index in kept)
+    joints, bodies, frames = list[Joint](), list[Asset](), [np.eye(4)]
+    for row, index in enumerate([0, *kept]):
+        if row:
+            joint = model.joints[index - 1]
+            frames.append(joint.pose)
+            parent, link = rows[joint.parent], names[joint.link]
+            pose = np.linalg.inv(frames[parent]) @ joint.pose
+            pose[:3, 3] += 0.0 if parent else shift
+            link += "_link" * (link in (identifier(entry.name), "joints"))  # names that exports give
+            joints.append(dataclasses.replace(joint, name=titles[joint.name], link=link, parent=parent, pose=pose))
+        back: Any = np.linalg.inv(frames[row]) if row else pose_of(shift, np.eye(3))
+        own = [piece for piece in pieces if rows[piece.link] == row]
+        parts = [part for piece in own for part in piece.parts]
+        even = merged_inertial([piece.solid for piece in own])
+        weight = weigh(_given(model, rows, row), parts, even, dataclasses.replace(entry, mass=None))
+        name = joints[-1].link if row else "base"
+        warnings += [f"link {name!r}: {text}" for text in weight.warnings if row]
+        mass, center, inertia = moved_inertial(back, weight.properties)
+        look = join(*(mesh for link, meshes in drawn if rows[link] == row for mesh in meshes))
+        look = moved(look, back[:3, :3], back[:3, 3])
+        turned = [ConvexPart(part.vertices @ back[:3, :3].T, part.faces) for part in parts]
+        fine = tuple(_shifted(part, back[:3, 3]) for part in turned)
+        looks: dict[str, Any] = {"visual": look, "fine": fine, "coarse": fine, "color": entry.color or (128, 128, 128)}
+        bodies.append(Asset(f"{entry.name}/{name}", name, name, mass, center, inertia, static=not row, **looks))
+    return tuple(joints), tuple(bodies)
 
 
 def _read(path: Path) -> Model:
@@ -401,14 +474,25 @@ def _scaled(model: Model, entry: AssetEntry) -> Model:
         return dataclasses.replace(old, pose=pose, size=tuple(scale * s for s in old.size))
 
     inertials = tuple(
-        MassProperties(i.mass * scale**3, scale * turn @ i.center_of_mass, scale**5 * turn @ i.inertia @ turn.T)
-        for i in model.inertials
+        (k, MassProperties(i.mass * scale**3, scale * turn @ i.center_of_mass, scale**5 * turn @ i.inertia @ turn.T))
+        for k, i in model.inertials
+    )
+    far = {"prismatic": scale, "revolute": 1.0}
+    joints = tuple(
+        dataclasses.replace(
+            j,
+            pose=pose_of(scale * turn @ j.pose[:3, 3], turn @ j.pose[:3, :3]),
+            limits=(j.limits[0] * far[j.kind], j.limits[1] * far[j.kind]),
+        )
+        for j in model.joints
     )
     notes = model.notes
-    if scale != 1.0 and any(i.mass > 0 for i in model.inertials) and entry.mass is None and entry.density is None:
+    if scale != 1.0 and any(i.mass > 0 for _, i in model.inertials) and entry.mass is None and entry.density is None:
         notes = (*notes, f"mass scaled by {scale:g} cubed")
     visuals, collisions = (tuple(map(shape, some)) for some in (model.visuals, model.collisions))
-    return Model(visuals, collisions, inertials, model.static, notes)
+    return dataclasses.replace(
+        model, visuals=visuals, collisions=collisions, inertials=inertials, notes=notes, joints=joints
+    )
 
 
 def _upright(up: Axis) -> Array:
@@ -437,13 +521,20 @@ def _diagonal(shapes: Sequence[Shape]) -> float:
     return float(np.linalg.norm(cloud.max(axis=0) - cloud.min(axis=0)))
 
 
+class _Piece(NamedTuple):
+    """A shape that collides."""
+
+    link: int  # as of the shape
+    parts: list[ConvexPart]
+    solid: MassProperties  # at 1 kg/m^3
+
+
 def _collide(
     shapes: Sequence[Shape], entry: AssetEntry, size: float, path: Path, notes: list[str], warnings: list[str]
-) -> tuple[list[ConvexPart], MassProperties]:
-    """Fine parts of all shapes and their solid at 1 kg/m^3; adds remarks to ``notes`` and ``warnings``."""
+) -> list[_Piece]:
+    """Fine parts and solids of all shapes; adds remarks to ``notes`` and ``warnings``."""
     tolerance = min(_CONVEX * size, _MAX_CONVEX)
-    parts: list[ConvexPart] = []
-    solids: list[MassProperties] = []
+    pieces: list[_Piece] = []
     repeated = 0
     seen: set[bytes] = set()
     for shape in shapes:
@@ -453,11 +544,11 @@ def _collide(
             repeated += 1
             continue
         seen.add(key)
-        parts += found.parts
-        solids.append(found.solid)
+        pieces += [_Piece(shape.link, found.parts, found.solid)] if found.parts else []
         seconds_left()
         notes += [note for note in found.notes if note not in notes]
         warnings += [warning for warning in found.warnings if warning not in warnings]
+    parts = [part for piece in pieces for part in piece.parts]
     if not parts:
         raise InvalidInputError(f"{path} spans no volume: all corners of its collision geometry lie in one plane")
     if repeated:
@@ -468,7 +559,7 @@ def _collide(
         notes.append(f"{thin} of {len(parts)} parts thinner than 3 mm (the thinnest {1e3 * min(widths):.2g} mm)")
     if len(parts) > _MANY_PARTS:
         notes.append(f"{len(parts)} parts; physics will be slow, a larger `concavity` gives fewer")
-    return parts, merged_inertial(solids)
+    return pieces
 
 
 def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trimesh | None) -> Array:

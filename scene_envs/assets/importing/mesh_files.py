@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
+from scene_envs.assets.base import Joint
 from scene_envs.assets.importing.limits import check_file, check_triangles, gltf_header, seconds_left
 from scene_envs.assets.shapes import MassProperties
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, SceneEnvsError
@@ -73,6 +74,7 @@ class Shape:
     part: tuple[str, bool] | None = None  # the one object of a mesh file, and whether its box is centred at the origin
     density: float | None = None  # kg/m^3, given by the model
     surface: trimesh.Trimesh | None = None  # the mesh itself, where it is no file of its own
+    link: int = 0  # number of the joint of the model that moves it, counted from 1; 0 for what does not move
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +83,11 @@ class Model:
 
     visuals: tuple[Shape, ...]  # shapes to draw
     collisions: tuple[Shape, ...]  # shapes for collisions
-    inertials: tuple[MassProperties, ...] = ()  # inertials of the links that have one
+    inertials: tuple[tuple[int, MassProperties], ...] = ()  # of the links that have one, with their joint as of shapes
     static: bool | None = None  # whether the model is fixed to the world; None when the file does not say
     notes: tuple[str, ...] = field(default=())  # choices of the reader that the file may not intend
+    joints: tuple[Joint, ...] = ()  # joints that move, each after its parent, with poses in the frame of the model
+    faults: tuple[str, ...] = ()  # what is wrong with joints, which are frozen
 
 
 def pose_of(translation: Array, rotation: Array) -> Array:
