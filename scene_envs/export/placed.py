@@ -121,7 +121,7 @@ class PlacedObject:
             return (self,)
         found = [replace(self, asset=b, mass=b.mass, inertia=b.inertia) for b in self.asset.bodies]
         for row, joint in enumerate(self.joints, start=1):
-            place = {"translation": joint.pose[:3, 3], "rotation": joint.pose[:3, :3]}
+            place: dict[str, Any] = {"translation": joint.pose[:3, 3], "rotation": joint.pose[:3, :3]}
             found[row] = replace(found[row], name=f"{self.name}/{joint.link}", welded=False, **place)
         return tuple(found)
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import colorsys
 import dataclasses
-import difflib
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -40,7 +38,7 @@ from scene_envs.assets.importing.solids import (
     visual_of,
 )
 from scene_envs.assets.shapes import MassProperties, join, mass_properties, moved
-from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.errors import Checked, CorruptFileError, InvalidInputError, Limit, Positive, unknown_name
 
 if TYPE_CHECKING:
     import trimesh
@@ -51,9 +49,6 @@ SUFFIXES = (".urdf", ".sdf", ".xml", ".usd", ".usda", ".usdc", *MESH_SUFFIXES)
 """Files that can become assets."""
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Base = Literal["bottom", "origin"]
-_TEXTS = ("file", "name", "display_name", "plural")
-_NUMBERS = ("scale", "density", "mass", "concavity")
-_CHOICES = {key: get_args(kind) for key, kind in (("up", Axis), ("base", Base), ("decomposition", Method))}
 DEFAULT_DENSITY = 500.0
 """Density (kg/m^3) used where neither the file nor the user gives one: wood, or a ceramic vessel with its air."""
 _POSSIBLE = (1.0, 23_000.0)
@@ -73,23 +68,32 @@ _SMALL, _LARGE = 2e-3, 20.0
 """Smallest and largest plausible diagonal (m); beyond them the file is probably not in metres."""
 
 
+def _one_of(words: Any) -> Limit:
+    return Limit(lambda value: value in get_args(words), f"must be one of {', '.join(get_args(words))}")
+
+
+_Text = Annotated[str, Limit(lambda value: isinstance(value, str), "must be text; put it in quotes")]
+
+
 @dataclass(frozen=True)
-class AssetEntry:
+class AssetEntry(Checked):
     """One asset of a library: its file, its names and how its file becomes a body."""
 
-    file: str  # relative to the folder
-    name: str = ""  # identifier; by default the stem of the file
-    display_name: str = ""  # in prompts; by default the identifier with spaces
-    plural: str = ""  # of the display name; the regular one by default
-    scale: float = 1.0  # factor on all lengths; a file in millimetres needs 0.001
-    density: float | None = None  # kg/m^3, of the evenly filled shape
-    mass: float | None = None  # kg
+    file: _Text  # relative to the folder
+    name: _Text = ""  # identifier; by default the stem of the file
+    display_name: _Text = ""  # in prompts; by default the identifier with spaces
+    plural: _Text = ""  # of the display name; the regular one by default
+    scale: Positive = 1.0  # factor on all lengths; a file in millimetres needs 0.001
+    density: Positive | None = None  # kg/m^3, of the evenly filled shape
+    mass: Positive | None = None  # kg
     welded: bool | None = None  # to the world; the file decides by default
-    up: Axis = "z"  # axis of the file that points up
+    up: Annotated[Axis, _one_of(Axis)] = "z"  # axis of the file that points up
     color: Color | None = None  # class colour (r, g, b), also for surfaces without one
-    base: Base = "bottom"  # "bottom": frame under the middle of the bounding box; "origin": as in the file
-    decomposition: Method = "auto"  # see convex_parts
-    concavity: float = 0.05  # CoACD's threshold, 0.01 (many parts) to 1 (one)
+    base: Annotated[Base, _one_of(Base)] = (
+        "bottom"  # "bottom": frame under the middle of the bounding box; "origin": as in the file
+    )
+    decomposition: Annotated[Method, _one_of(Method)] = "auto"  # see convex_parts
+    concavity: Positive = 0.05  # CoACD's threshold, 0.01 (many parts) to 1 (one)
 
 
 def read_entries(path: Path) -> list[AssetEntry]:
@@ -133,8 +137,8 @@ def default_entry(file: str) -> AssetEntry:
 def _named(values: dict[str, Any]) -> AssetEntry:
     file = Path(values["file"])
     values.setdefault("name", "_".join(file.stem.split()))
-    values.setdefault("display_name", " ".join(values["name"].replace("_", " ").split()) or values["name"])
-    values.setdefault("plural", regular_plural(values["display_name"]))
+    values.setdefault("display_name", " ".join(str(values["name"]).replace("_", " ").split()) or values["name"])
+    values.setdefault("plural", regular_plural(str(values["display_name"])))
     return AssetEntry(**values)
 
 
@@ -142,11 +146,8 @@ def _entry(item: Any, where: str, folder: Path) -> AssetEntry:
     if not isinstance(item, Mapping):
         raise InvalidInputError(f"{where} must be a mapping such as `file: mug.urdf`, got {item!r}")
     known = [field.name for field in fields(AssetEntry)]
-    for key in item:
-        if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.4)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise InvalidInputError(f"{where}: unknown key {key!r}{hint} Known: {', '.join(known)}.")
+    if unknown := [str(key) for key in item if key not in known]:
+        raise InvalidInputError(f"{where}: {unknown_name('key', unknown[0], known)}")
     if not isinstance(item.get("file"), str) or not item["file"]:
         raise InvalidInputError(f"{where} needs a `file`")
     where = f"{where} ({item['file']})"
@@ -155,33 +156,20 @@ def _entry(item: Any, where: str, folder: Path) -> AssetEntry:
         raise InvalidInputError(f"{where}: files of type {path.suffix!r} cannot be read; known: {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise InvalidInputError(f"{where}: there is no such file in {folder}")
-    values = {key: _value(key, value, where) for key, value in item.items() if value is not None}
+    texts = {key: value.strip() if isinstance(value, str) else value for key, value in item.items()}
+    values = {key: value for key, value in texts.items() if value is not None and value != ""}
     if "mass" in values and "density" in values:
         raise InvalidInputError(f"{where}: give mass or density, not both")
     if values.get("welded") and ("mass" in values or "density" in values):
         raise InvalidInputError(f"{where}: a welded asset has no mass; drop `mass` and `density`, or `welded`")
-    return _named(values)
-
-
-def _value(key: str, value: Any, where: str) -> Any:
-    if key in _TEXTS:
-        if not isinstance(value, str) or not value.strip():
-            raise InvalidInputError(f"{where}: {key} must be text, got {value!r}; put it in quotes")
-        return value.strip()
-    if key in _NUMBERS:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not math.isfinite(value) or value <= 0:
-            raise InvalidInputError(f"{where}: {key} must be a number above 0, got {value!r}")
-        return float(value)
-    if key in _CHOICES:
-        if value not in _CHOICES[key]:
-            raise InvalidInputError(f"{where}: {key} must be one of {', '.join(_CHOICES[key])}, got {value!r}")
-        return value
-    if key == "welded":
-        if not isinstance(value, bool):
-            raise InvalidInputError(f"{where}: welded must be true or false, got {value!r}")
-        return value
-    return _color(value, where)
+    if not isinstance(values.get("welded", True), bool):
+        raise InvalidInputError(f"{where}: welded must be true or false, got {values['welded']!r}")
+    if "color" in values:
+        values["color"] = _color(values["color"], where)
+    try:
+        return _named(values)
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{where}: {error}") from None
 
 
 def _color(value: Any, where: str) -> Color:
@@ -341,7 +329,9 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
         raise InvalidInputError(f"{path} has neither visual nor collision geometry")
     if not model.collisions:
         notes.append("no collision geometry: the visual one is used")
-    size = _diagonal(shapes)
+    bare = (meshes_of(shape) if shape.kind == "mesh" else visual_of(shape, None) for shape in shapes)
+    corners = [mesh.vertices for meshes in bare for mesh in meshes]
+    size = float(np.linalg.norm(np.ptp(np.concatenate(corners), axis=0)))
     if not _SMALL <= size <= _LARGE:
         warnings.append(f"it is {size:.3g} m large; if the file is not in metres, set `scale`")
     pieces = _collide(shapes, entry, size, path, notes, warnings)
@@ -504,21 +494,6 @@ def _upright(up: Axis) -> Array:
         "-z": np.diag([1.0, -1.0, -1.0]),
     }
     return quarter[up] if up in quarter else quarter["-z"] @ quarter[up[1:]]
-
-
-def _diagonal(shapes: Sequence[Shape]) -> float:
-    """Length (m) of the diagonal of the bounding box of all shapes."""
-    points = []
-    for shape in shapes:
-        if shape.kind == "mesh":
-            points += [np.asarray(mesh.vertices) for mesh in meshes_of(shape)]
-        else:
-            reach = sum(shape.size) if shape.kind == "capsule" else max(shape.size)
-            half = np.array(shape.size) / 2 if shape.kind == "box" else np.full(3, reach)
-            corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
-            points.append(corners @ shape.pose[:3, :3].T + shape.pose[:3, 3])
-    cloud = np.concatenate(points)
-    return float(np.linalg.norm(cloud.max(axis=0) - cloud.min(axis=0)))
 
 
 class _Piece(NamedTuple):

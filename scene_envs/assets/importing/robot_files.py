@@ -44,7 +44,6 @@ _TO_WORLD = "a joint holds it at `world`"
 _LEFT_OUT = ("nu actuators", "nsensor sensors", "ntendon tendons", "neq constraints", "nflex flexes", "nskin skins",
              "nplugin plugins", "ngravcomp gravcomp")  # fmt: skip
 """The sizes of a model in MuJoCo that count what an asset does not have."""
-_KINDS: dict[int, Literal["prismatic", "revolute"]] = {2: "prismatic", 3: "revolute"}  # of MuJoCo
 _OF_JOINTS = ("limit", "dynamics", "mimic")
 _NOT_OF_USD = ("kinematicEnabled", "velocity", "angularVelocity", "restitution")
 """Properties of UsdPhysics that an asset does not have."""
@@ -137,18 +136,6 @@ class _Reading:
         self.faults.append(f"{self.path}: {where} {fault}")
         return None
 
-    def articulate(self, holding: Mapping[str, tuple[str, Joint | None]]) -> None:
-        """Sort the joints and number the links, from the parent and the joint that hold each link."""
-        left = dict(holding)
-        while ready := [link for link in left if left[link][0] not in left]:
-            for link in ready:
-                parent, joint = left.pop(link)
-                self.rows[link] = self.rows.get(parent, 0)
-                if joint is not None:
-                    self.joints.append(replace(joint, parent=self.rows[link]))
-                    self.rows[link] = len(self.joints)
-        self.frozen += [f"{joint.name} (in a loop)" for _, joint in left.values() if joint is not None]
-
     def add(self, link: Element, place: Callable[[Element, str], Array], materials: _Colors) -> list[Shape]:
         """Read the shapes of a link, whose poses in the model frame ``place`` gives; returns its collisions."""
         before = len(self.shapes["collision"])
@@ -171,6 +158,19 @@ class _Reading:
         visuals, collisions = map(tuple, self.shapes.values())
         joints = tuple(self.joints), tuple(self.faults)
         return Model(visuals, collisions, tuple(self.inertials), bool(welded) or None, tuple(self.notes), *joints)
+
+
+def _numbered(holding: Mapping[Any, tuple[Any, Joint | None]]) -> tuple[dict[Any, int], list[Joint], list[str]]:
+    """Number of each link, the joints in this order, and the names of those in loops, from what holds each link."""
+    left, rows, joints = dict(holding), dict[Any, int](), list[Joint]()
+    while ready := [link for link in left if left[link][0] not in left]:
+        for link in ready:
+            parent, joint = left.pop(link)
+            rows[link] = rows.get(parent, 0)
+            if joint is not None:
+                joints.append(replace(joint, parent=rows[link]))
+                rows[link] = len(joints)
+    return rows, joints, [f"{joint.name} (in a loop)" for _, joint in left.values() if joint is not None]
 
 
 def _why_still(joint: Joint) -> list[str]:
@@ -204,7 +204,8 @@ def read_sdf(path: Path) -> Model:
             reading.frozen += [] if joint.get("type") == "fixed" else [f"{joint.get('name', '?')} ({why})"]
         if child in links:
             holding[child] = parent, None if why else _sdf_joint(joint, child, frames, reading, root.get("version"))
-    reading.articulate(holding)
+    reading.rows, reading.joints, looped = _numbered(holding)
+    reading.frozen += looped
     for name, link in links.items():
         pose = frames.pose(name)
         collisions = reading.add(link, partial(frames.place, name), {})
@@ -396,7 +397,8 @@ def read_urdf(path: Path) -> Model:
         links.setdefault("world", Element("link", name="world"))
     poses, held_by = _link_poses(robot, links, path)
     still = np.eye(3)
-    reading.articulate({c: (parent, reading.joint(j, c, poses[c], still)) for c, (parent, j) in held_by.items()})
+    held_with = {link: (parent, reading.joint(j, link, poses[link], still)) for link, (parent, j) in held_by.items()}
+    reading.rows, reading.joints, _ = _numbered(held_with)
     materials: dict[str, Color | None] = {}
     for material in [*robot.findall("material"), *robot.findall("link/visual/material")]:
         if material.find("color") is not None:  # it may be defined inside any visual
@@ -504,36 +506,41 @@ def read_mjcf(path: Path) -> Model:
     free = any(model.jnt_type[j] == 0 and model.jnt_bodyid[j] == root for j in range(model.njnt))
     if not free:
         notes.append("it has no free joint: it is welded (`welded: false` makes it free)")
-    return Model(tuple(visuals), tuple(collisions), tuple(inertials), None if free else True, tuple(notes), joints)
+    return Model(
+        tuple(visuals), tuple(collisions), tuple(inertials), None if free else True, tuple(notes), tuple(joints)
+    )
 
 
 def _hinges(
     model: Any, data: Any, root: int, bodies: list[int], base: Any
-) -> tuple[dict[int, int], tuple[Joint, ...], list[str]]:
+) -> tuple[dict[int, int], list[Joint], list[str]]:
     """For each body the number of the joint that moves it, the joints, and the names of frozen ones."""
-    rows, joints, frozen = dict.fromkeys(bodies, 0), list[Joint](), list[str]()
     follows = set(model.eq_obj1id[model.eq_type == 2].tolist())  # mjEQ_JOINT
+    holding, frozen = dict[int, tuple[int, Joint | None]](), list[str]()
     for body in bodies:
-        parent = rows.get(int(model.body_parentid[body]), 0)
-        rows[body] = 0 if body == root else parent
         own = [j for j in range(model.njnt) if model.jnt_bodyid[j] == body and model.jnt_type[j] != 0]
-        why = "of the first body" if body == root else "several of a body" if len(own) > 1 else ""
+        held, why = None, "of the first body" if body == root else "several of a body" if len(own) > 1 else ""
         for j in own:
-            name = model.joint(j).name or f"joint_{j}"
-            if reason := "ball" if model.jnt_type[j] == 1 else "mimic" if j in follows else why:
-                frozen.append(f"{name} ({reason})")
-                continue
+            reason = "ball" if model.jnt_type[j] == 1 else "mimic" if j in follows else why
             dof, zero = model.jnt_dofadr[j], model.qpos0[model.jnt_qposadr[j]]
-            limits = tuple((model.jnt_range[j] - zero).tolist()) if model.jnt_limited[j] else (-np.inf, np.inf)
-            pose, kind = base @ pose_of(data.xanchor[j], data.xmat[body].reshape(3, 3)), _KINDS[int(model.jnt_type[j])]
-            rubs = float(model.dof_damping[dof]), float(model.dof_frictionloss[dof])
-            link = model.body(body).name or f"body_{body}"
-            joint = Joint(name, link, parent, kind, pose, model.jnt_axis[j].astype(float), limits, *rubs)
-            frozen += _why_still(joint)
-            if not _why_still(joint):
-                joints.append(joint)
-                rows[body] = len(joints)
-    return rows, tuple(joints), frozen
+            low, high = (model.jnt_range[j] - zero).tolist() if model.jnt_limited[j] else (-np.inf, np.inf)
+            joint = Joint(
+                name=model.joint(j).name or f"joint_{j}",
+                link=model.body(body).name or f"body_{body}",
+                parent=0,
+                kind="prismatic" if model.jnt_type[j] == 2 else "revolute",
+                pose=base @ pose_of(data.xanchor[j], data.xmat[body].reshape(3, 3)),
+                axis=model.jnt_axis[j].astype(float),
+                limits=(low, high),
+                damping=float(model.dof_damping[dof]),
+                friction=float(model.dof_frictionloss[dof]),
+            )
+            still = [f"{joint.name} ({reason})"] if reason else _why_still(joint)
+            frozen += still
+            held = None if still else joint
+        holding[body] = int(model.body_parentid[body]) if body else -1, held
+    rows, joints, _ = _numbered(holding)
+    return rows, joints, frozen
 
 
 def _root_body(model: Any, path: Path) -> int:
