@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from scene_envs.assets.base import identifier
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.export.formats import _FORMATS, resolve_formats
 from scene_envs.export.placed import AssetFiles, PlacedObject, place
-from scene_envs.export.randomization import randomize, read_randomization
+from scene_envs.export.randomization import randomize, read_randomization, record
 from scene_envs.files import write_json
 from scene_envs.physics.parts import FRICTION
 from scene_envs.scene import SceneBatch
@@ -66,8 +67,8 @@ def export(
         formats: One or several names, or ``"all"`` for those with a file per scene that can be written here; see
             :func:`scene_envs.export.list_formats`.
         friction: Coulomb friction coefficient between any two surfaces; by default that of :mod:`scene_envs.physics`.
-        randomization: Distributions of mass, friction and colour (:mod:`scene_envs.export.randomization`);
-            ``randomization.json`` of each scene says what its objects got.
+        randomization: Distributions of mass, friction, colours, textures, light and camera
+            (:mod:`scene_envs.export.randomization`); ``randomization.json`` of each scene says what it got.
 
     Raises:
         UnknownNameError: no such format.
@@ -78,8 +79,12 @@ def export(
         raise InvalidInputError(f"friction must be a finite number >= 0, got {friction}")
     names = resolve_formats(formats)
     writers = {name: _FORMATS[name].writer() for name in names}
-    settings = read_randomization(randomization, names)
-    placed = [randomize(scene, settings) for scene in place(batch, friction)]
+    settings = read_randomization(randomization)
+    seen: Counter[bytes] = Counter()
+    placed = []
+    for scene in place(batch, friction):
+        placed.append(randomize(scene, settings, seen[scene.digest]))
+        seen[scene.digest] += 1
     root = Path(output)
     manifest = _claim(root, batch, friction, settings)
     package = f"{identifier(batch.scene_type.name)}_{manifest['digest'][:8]}"
@@ -90,8 +95,8 @@ def export(
         folder = root / place_of
         folder.mkdir(exist_ok=True)
         if settings:
-            values = {x.name: {"mass": x.mass, "friction": x.friction, "color": x.color} for x in scene.objects}
-            write_json(folder / "randomization.json", {**settings, "verdict": "nominal", "objects": values})
+            content = record(scene, settings, sorted({*manifest["formats"], *names}))
+            write_json(folder / "randomization.json", content)
         scenes.append({name: whole.get(name) or write(scene, files, folder) for name, write in writers.items()})
         if not any(folder.iterdir()):
             folder.rmdir()

@@ -21,8 +21,9 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     world = ET.SubElement(root, "world", name=f"{scene.scene_type.name}_{scene.index}")
     light = ET.SubElement(world, "light", type="directional", name="sun")
     _text(light, "pose", "0 0 10 0 0 0")
-    _text(light, "direction", "-0.3 0.4 -1")
-    _text(light, "diffuse", "0.9 0.9 0.9 1")
+    _text(light, "direction", numbers(scene.light.direction))
+    _text(light, "diffuse", f"{numbers(0.9 * np.array(scene.light.color))} 1")
+    _text(light, "intensity", number(scene.light.intensity))
     for item in scene.objects:
         _add_model(world, item, files, folder)
     return write_xml(root, folder / "world.sdf")
@@ -72,7 +73,15 @@ def _add_link(model: ET.Element, name: str, item: PlacedObject, files: AssetFile
         for tag, text in inertia_entries(item).items():
             _text(inertia, tag, text)
     visual = ET.SubElement(link, "visual", name="visual")
-    _add_mesh(visual, files.visual(asset), folder)
+    file = files.visual(asset, item.texture)
+    _add_mesh(visual, file, folder)
+    if item.tinted:  # a material of a visual replaces that of its mesh
+        material = ET.SubElement(visual, "material")
+        _text(material, "diffuse", f"{numbers(item.color)} 1")
+        metal = ET.SubElement(ET.SubElement(material, "pbr"), "metal")
+        _text(metal, "albedo_map", relative(file.with_suffix(".png"), folder))
+        _text(metal, "roughness", "0.7")
+        _text(metal, "metalness", "0")
     for part in files.parts(asset):
         collision = ET.SubElement(link, "collision", name=part.stem)
         ET.SubElement(_add_mesh(collision, part, folder), "drake:declare_convex")

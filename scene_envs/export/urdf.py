@@ -42,10 +42,10 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
 
 def object_urdf(item: PlacedObject, files: AssetFiles, folder: Path, kind: str = "") -> Path:
     """``<name>.urdf`` with exact parts, or of kind ``_bullet``, with parts that have their true size in PyBullet,
-    which adds a margin. An object with mass or friction of its own has it in ``folder``. Mass may be 0 here.
+    which adds a margin. An object with values of its own has it in ``folder``. Mass may be 0 here.
     """
     asset = item.asset
-    if (item.mass, item.friction) != (asset.mass, files.friction):
+    if (item.mass, item.friction, item.texture, item.tinted) != (asset.mass, files.friction, "none", False):
         return _write(item, files, kind, folder / f"{item.name}{kind}.urdf")
     name = f"{files.name(asset)}{kind}.urdf"
     return files.once(asset, f"urdf{kind}", lambda own: _write(item, files, kind, own / name))
@@ -106,8 +106,11 @@ def _add_link(root: ET.Element, name: str, item: PlacedObject, files: AssetFiles
     ET.SubElement(inertial, "origin", xyz=numbers(asset.center_of_mass), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=number(item.mass))
     ET.SubElement(inertial, "inertia", inertia_entries(item))
-    visual = ET.SubElement(ET.SubElement(link, "visual"), "geometry")
-    ET.SubElement(visual, "mesh", filename=relative(files.visual(asset), path.parent))
+    visual, file = ET.SubElement(link, "visual"), files.visual(asset, item.texture)
+    ET.SubElement(ET.SubElement(visual, "geometry"), "mesh", filename=relative(file, path.parent))
+    if item.tinted:
+        material = ET.SubElement(visual, "material", name=f"{item.name}.color")
+        ET.SubElement(material, "color", rgba=f"{numbers(item.color)} 1")
     for part in files.inset_parts(asset, BULLET_MARGIN) if kind else files.parts(asset):
         collision = ET.SubElement(link, "collision", name=part.stem)
         mesh = ET.SubElement(ET.SubElement(collision, "geometry"), "mesh", filename=relative(part, path.parent))

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.export.api import MANIFEST, read_manifest, scene_folders
+from scene_envs.export.randomization import PHYSICS
 from scene_envs.files import write_json, write_text
 from scene_envs.physics.parts import FRICTION, GRAVITY, angle_between
 
@@ -91,7 +92,7 @@ def verify(path: str | os.PathLike[str]) -> Verification:
             missing[judge] = f"not installed: pip install {package}"
         elif not all(path.is_file() for path in paths):
             missing[judge] = f"no {file.format(scenes[0] if scenes else 'scene').rpartition('/')[2]} in the export"
-        elif file == _POSES and (manifest["friction"] != FRICTION or manifest.get("randomization")):
+        elif file == _POSES and (manifest["friction"] != FRICTION or PHYSICS & {*manifest.get("randomization", ())}):
             missing[judge] = "has other friction or masses than the files"
         else:
             found = importlib.metadata.distributions(name=package.strip('"').partition("[")[0])
