@@ -424,8 +424,11 @@ def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: s
     """Values of the options chosen, as Hydra composes them; interpolations are not resolved. ``choices`` are options by
     field, ``recipe`` and ``+experiment``. An InvalidInputError if Hydra cannot read a file.
     """
-    if not choices:
-        return {}
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    if not config_dir and "recipe" not in choices and choices.keys() <= fields.keys():
+        nodes = {key: _nodes(fields[key]).get(option) for key, option in choices.items()}
+        if None not in nodes.values():  # nothing to compose
+            return copy.deepcopy(nodes)
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
@@ -440,6 +443,13 @@ def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: s
         raise InvalidInputError(f"{command}: {reason_of(error)}") from error
 
 
+def _nodes(field: dataclasses.Field[Any], config_dir: str = "") -> dict[str, Any]:
+    """The values of a field's registered options; a file of the same name takes the place of an option."""
+    found, files = field.metadata["registered"](), group_options(field.metadata["folder"], config_dir)
+    values = found if isinstance(found, Mapping) else {option: {"name": option} for option in found}
+    return {option: dict(value) for option, value in values.items() if option not in files}
+
+
 def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str = "") -> dict[str, Any]:
     """The composition of a config whose groups are empty but for the options chosen."""
     from hydra import compose, initialize_config_module
@@ -451,11 +461,9 @@ def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str =
         if not (folder := field.metadata.get("folder")):
             continue
         paths[field.name] = folder if folder == field.name else f"{folder}@{field.name}"
-        found = field.metadata["registered"]()
-        nodes = found if isinstance(found, Mapping) else {option: {"name": option} for option in found}
         store.repo.pop(folder, None)
-        for option in nodes.keys() - set(group_options(folder, config_dir)):  # a file takes the place of a node
-            store.store(group=folder, name=option, node=dict(nodes[option]))
+        for option, node in _nodes(field, config_dir).items():
+            store.store(group=folder, name=option, node=node)
     recipe = ["recipe" for field in dataclasses.fields(kind) if field.name == "recipe"]
     defaults = ["_self_", *({path: None} for path in [*paths.values(), *recipe])]
     places = [f"file://{Path(config_dir).resolve()}"] if config_dir else []

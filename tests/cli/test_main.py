@@ -67,6 +67,8 @@ def test_help_loads_nothing_heavy():
     code = (
         "import sys; from agents.cli import main\n"
         f"for command in {list(COMMANDS)}: main([command, '--help'])\n"
+        "main(['post-train', 'reward=clutter', 'algorithm=nft', 'prior=dimsum_table', '--help'])\n"
+        "main(['search', 'planner=mcts', 'mask=culprits', 'prompt=a cup', '--help'])\n"
         "print({'torch', 'hydra', 'matplotlib', 'pybullet'} & set(sys.modules), file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

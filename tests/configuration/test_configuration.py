@@ -142,8 +142,10 @@ def test_a_recipe_is_the_same_in_python(kind: Any, recipe: str) -> None:
 
 
 @pytest.mark.slow
-def test_every_option_of_a_group_composes() -> None:
-    """Each option with one command at least, and each group of a command with one option at least."""
+def test_every_option_of_a_group_composes(tmp_path: Path) -> None:
+    """Each option with one command at least, and each group of a command with one option at least; registered options
+    have the values that Hydra composes, as it does where there is a folder of the user's.
+    """
     seen: set[tuple[str, str]] = set()
     for command in SMALLEST_FIRST:
         columns = []
@@ -156,7 +158,9 @@ def test_every_option_of_a_group_composes() -> None:
                 seen |= {(folder, option) for option in options}
         for words in itertools.zip_longest(*columns):  # an option of every group at once
             given = [word for word in words if word]
-            assert isinstance(compose(command, CONFIGS[command], given), CONFIGS[command])
+            made = compose(command, CONFIGS[command], given)
+            assert isinstance(made, CONFIGS[command])
+            assert made == compose(command, CONFIGS[command], given, config_dir=str(tmp_path))
 
 
 @pytest.mark.parametrize(
