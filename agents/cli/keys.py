@@ -22,7 +22,7 @@ from agents.configuration.composition import (
     field_options,
     group_options,
     hint_of,
-    merged,
+    layered,
     parse_config,
     verbatim,
 )
@@ -181,7 +181,7 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
         raise InvalidInputError(f"--config-dir {config_dir}: no such folder")
     tree = read_config(config_file) if config_file else {}
     tree.pop("output", None)  # a run that is started again has a folder of its own
-    choices: dict[str, str] = {}
+    choices: dict[str, str] = _chosen(tree, fields, config_dir)
     values: dict[str, Any] = {}
     adapter = ""
     for word in words:
@@ -211,9 +211,10 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
     replaced = {*choices, *(key for key in values if key in fields and fields[key].metadata.get("named"))}
     tree = verbatim({key: value for key, value in tree.items() if key not in replaced})
     made = by_hydra(command, config, choices, config_dir)
+    made |= by_hydra(command, config, _chosen(made, fields, config_dir), config_dir)
     for key, value in values.items():
         made = _with(made, key, value, config, tree)
-    settings: Any = build(config, merged(tree, made), command=command)
+    settings: Any = build(config, layered(config, tree, made), command=command)
     if not adapter:
         return settings
     if not settings.prior:
@@ -229,6 +230,13 @@ def read_config(path: str) -> dict[str, Any]:
         raise InvalidInputError(f"--config {path}: {error.strerror}; name the config.yaml of a run") from None
     except UnicodeDecodeError as error:
         raise CorruptFileError(f"--config {path} is not YAML ({error})") from error
+
+
+def _chosen(values: Mapping[str, Any], fields: Mapping[str, dataclasses.Field[Any]], config_dir: str) -> dict[str, str]:
+    """Options of groups that a file names by a text, as a word does."""
+    texts = {key: value for key, value in values.items() if isinstance(value, str) and key in fields}
+    groups = {key: value for key, value in texts.items() if dataclasses.is_dataclass(fields[key].default_factory)}
+    return {key: value for key, value in groups.items() if _is_option(fields[key], key, value, config_dir)}
 
 
 def _is_option(field: dataclasses.Field[Any], key: str, value: str, config_dir: str) -> bool:
@@ -280,9 +288,8 @@ def _with(made: Mapping[str, Any], key: str, value: Any, config: type, tree: Map
     if not inner and not dataclasses.is_dataclass(_hint(config, head)):
         return {**made, key: value}
     (field,) = (field for field in dataclasses.fields(config) if field.name == head)
-    if field.metadata.get("named") and not isinstance(made.get(head), Mapping):
-        before = made.get(head, tree.get(head, field.default))
-        made = {**made, head: before if isinstance(before, Mapping) else {"name": before}}
+    if field.metadata.get("named"):
+        made = {head: tree.get(head, field.default), **made}
     for part in reversed([head, *inner]):
         value = {part: value}
-    return merged(made, value)
+    return layered(config, made, value)

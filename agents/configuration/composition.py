@@ -95,6 +95,7 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
                 raise InvalidInputError(f"{path}{field.name}={typed} is neither a name nor a mapping with a name")
             values[field.name] = _shortest(value)
     try:
+        _check_kinds(schema, values, path)
         made: Any = OmegaConf.to_object(OmegaConf.merge(schema, values))
     except errors.InterpolationResolutionError as error:
         place = f"{command}: {path}{error.full_key}".removeprefix(": ")
@@ -105,7 +106,6 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
         known = [path + key for key in dotted(OmegaConf.to_container(schema))]  # type: ignore[arg-type]
         raise unknown_name(f"{command} key".strip(), f"{path}{error.full_key}", known) from error
     except errors.OmegaConfBaseException as error:
-        _require_groups(schema, values, path)
         place = (error.full_key or "").partition("[")[0]
         parent, _, name = place.rpartition(".")
         hint = hint_of(OmegaConf.get_type(OmegaConf.select(schema, parent) if parent else schema), name)
@@ -114,15 +114,18 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
     return made
 
 
-def _require_groups(schema: Any, values: Mapping[str, Any], path: str) -> None:
-    """Refuse a value in the place of a group of keys."""
+def _check_kinds(schema: Any, values: Mapping[str, Any], path: str) -> None:
+    """Refuse a value in the place of a group of keys, and a number in that of a boolean, which OmegaConf takes."""
     from omegaconf import DictConfig, OmegaConf
 
     for key, value in values.items():
         if isinstance(group := schema[key], DictConfig) and dataclasses.is_dataclass(OmegaConf.get_type(group)):
-            if not isinstance(value, Mapping):
+            if isinstance(value, Mapping):
+                _check_kinds(group, value, f"{path}{key}.")
+            elif not str(value).startswith("${"):
                 raise _no_group(path + key, value, group)
-            _require_groups(group, value, f"{path}{key}.")
+        elif isinstance(group, bool) and isinstance(value, int | float) and not isinstance(value, bool):
+            raise _refusal(bool, value, path + key)
 
 
 def _no_group(path: str, value: Any, keys: Iterable[Any]) -> InvalidInputError:
@@ -183,7 +186,7 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
         for part in reversed(inner):
             value = {part: value}
         before = plain_tree(values.get(head, getattr(config, head)))
-        values[head] = merged(before, value) if inner and isinstance(before, Mapping) else value
+        values[head] = layered(type(config), {head: before}, {head: value})[head] if inner else value
     groups = {name: _group(fields[name], value) for name, value in values.items() if isinstance(value, Mapping)}
     return dataclasses.replace(config, **{**values, **groups})  # type: ignore[type-var]
 
@@ -413,7 +416,7 @@ def _complete(kind: type, given: Mapping[str, Any], fields: Mapping[str, datacla
     tree = by_hydra(kind.__name__, kind, choices)
     for name in given.keys() - options:
         is_part = dataclasses.is_dataclass(fields[name].default_factory) and isinstance(given[name], Mapping)
-        tree[name] = merged(tree.get(name, {}), given[name]) if is_part else given[name]
+        tree = layered(kind, tree, {name: given[name]}) if is_part else {**tree, name: given[name]}
     return {name: _group(fields[name], value) for name, value in tree.items()}
 
 
@@ -425,7 +428,11 @@ def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: s
     field, ``recipe`` and ``+experiment``. An InvalidInputError if Hydra cannot read a file.
     """
     fields = {field.name: field for field in dataclasses.fields(kind)}
-    if not config_dir and "recipe" not in choices and choices.keys() <= fields.keys():
+    sets = {key: option for key, option in choices.items() if key in ("recipe", "+experiment")}
+    if sets and len(sets) < len(choices):  # options go over the values of the sets
+        options = {key: option for key, option in choices.items() if key not in sets}
+        return layered(kind, by_hydra(command, kind, sets, config_dir), by_hydra(command, kind, options, config_dir))
+    if not config_dir and not sets:
         nodes = {key: _nodes(fields[key]).get(option) for key, option in choices.items()}
         if None not in nodes.values():  # nothing to compose
             return copy.deepcopy(nodes)
@@ -476,6 +483,21 @@ def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str =
 
 
 _compose_once = functools.lru_cache(maxsize=256)(_compose)
+
+
+def layered(kind: type, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of the config ``kind``, those of ``second`` over those of ``first``; a component of another name takes the
+    place of the first one with all its settings.
+    """
+    first = dict(first)
+    for field in dataclasses.fields(kind):
+        now = second.get(field.name)
+        if isinstance(now, Mapping) and (field.metadata.get("kinds") or field.metadata.get("named")):
+            before = first.pop(field.name, {})
+            before = {"name": before} if isinstance(before, str) else before
+            if isinstance(before, Mapping) and len({part["name"] for part in (before, now) if "name" in part}) < 2:
+                first[field.name] = before
+    return merged(first, second)
 
 
 def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:

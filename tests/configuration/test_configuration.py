@@ -212,6 +212,62 @@ def test_words_win_over_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "words", "expected"),
+    [
+        ("algorithm: nft", [], {"name": "nft", "beta": 0.5}),
+        ("algorithm: nft", ["algorithm.beta=0.3"], {"name": "nft", "beta": 0.3}),
+        ("algorithm: {name: nft, beta: 0.2}", ["algorithm.draws=3"], {"name": "nft", "beta": 0.2, "draws": 3}),
+        ("algorithm: {name: nft, beta: 0.2}", ["algorithm={name: ddpo_sf}"], {"name": "ddpo_sf", "gradient_steps": 8}),
+        ("algorithm: {name: nft, beta: 0.2}", ["algorithm.name=ddpo_sf"], {"name": "ddpo_sf", "gradient_steps": 8}),
+        ("algorithm: {name: ddpo_sf, min_std: 0.2}", ["algorithm=nft"], {"name": "nft", "beta": 0.5}),
+    ],
+)
+def test_a_component_of_a_file_keeps_its_name_or_gives_way_to_another(
+    text: str, words: list[str], expected: dict[str, Any], tmp_path: Path
+) -> None:
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "config.yaml").write_text(text)
+    (tmp_path / "experiment" / "named.yaml").write_text(f"# @package _global_\n{text}\n")
+    found = [
+        compose("post-train", PostTrainConfig, words, config_file=str(tmp_path / "config.yaml")),
+        compose("post-train", PostTrainConfig, ["+experiment=named", *words], config_dir=str(tmp_path)),
+        changed(compose("x", PostTrainConfig, ["algorithm=ddpo_is"]), {"algorithm": expected}),
+    ]
+    for settings in found:
+        assert expected.items() <= vars(settings.algorithm).items()
+    assert found[0] == found[1]
+    assert found[0].algorithm == found[2].algorithm
+
+
+def test_an_algorithm_beside_a_recipe_takes_nothing_of_the_recipe_s() -> None:
+    """The recipe has DDPO with ``gradient_steps: 8``, which NFT does not know."""
+    found = compose("post-train", PostTrainConfig, ["recipe=demo_clutter", "algorithm=nft"])
+    assert (found.algorithm, found.iterations) == (PostTrainConfig(algorithm="nft").algorithm, 24)
+    assert PostTrainConfig(recipe="demo_clutter", algorithm="nft") == found
+    assert changed(found, {"algorithm.name": "ddpo_sf"}).algorithm == PostTrainConfig().algorithm
+
+
+def test_an_option_of_a_file_is_one_of_the_group(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("network: paper")
+    source = str(tmp_path / "config.yaml")
+    found = compose("pretrain", PretrainConfig, ["network.depth=3"], config_file=source).network
+    assert (found.hidden, found.depth) == (512, 3)
+    (tmp_path / "config.yaml").write_text("network: papr")
+    with pytest.raises(UnknownNameError, match="unknown network 'papr'; did you mean 'paper'"):
+        compose("pretrain", PretrainConfig, [], config_file=source)
+
+
+@pytest.mark.parametrize("value", ["2", "1", "0", "1.0"])
+def test_a_number_is_no_boolean(value: str, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(f"network: {{modules: {{contacts: {value}}}}}\n")
+    with pytest.raises(InvalidInputError, match=f"network.modules.contacts={value} is not true or false"):
+        compose("pretrain", PretrainConfig, [], config_file=str(tmp_path / "config.yaml"))
+    with pytest.raises(InvalidInputError, match=f"project={value} is not true or false"):
+        compose("sample", CONFIGS["sample"], [f"project={value}"])
+    assert compose("sample", CONFIGS["sample"], ["project=yes"]).project is True
+
+
+@pytest.mark.parametrize(
     ("words", "key", "value"),
     [
         (["seed=${iterations}"], "seed", 60),
