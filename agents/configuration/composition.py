@@ -214,17 +214,18 @@ def dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def check_same_keys(
-    folder: Path, before: Mapping[str, Any], now: Mapping[str, Any], may_differ: Collection[str]
+    folder: Path, before: Mapping[str, Any], now: Mapping[str, Any], may_differ: Collection[str], kind: type
 ) -> None:
     """Refuse to go on in a folder that was written with other values of keys, but for those that ``may_differ``; keys
-    of only one of the two do not count, unless they stand in a group of both.
+    of only one of the two do not count, also in a group of the config ``kind``. Settings of a reward or mask do.
     """
+    groups = [field.name for field in dataclasses.fields(kind) if dataclasses.is_dataclass(field.default_factory)]
     heads = [key for key in now if key in before and key not in may_differ and before[key] != now[key]]
     was, is_now = (dotted({key: values[key] for key in heads}) for values in (before, now))
     told = [
         f"{key} was {was.get(key)!r}, is {is_now.get(key)!r}"
         for key in {**was, **is_now}
-        if was.get(key) != is_now.get(key)
+        if was.get(key) != is_now.get(key) and (key.partition(".")[0] not in groups or (key in was and key in is_now))
     ]
     if told:
         raise InvalidInputError(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from agents.configuration.composition import check_same_keys
-from agents.post_training.settings import RESUMABLE
+from agents.post_training.settings import RESUMABLE, PostTrainConfig
 from agents.utils.checkpoints import load_checkpoint
 from scene_envs import files
 from scene_envs.errors import TrainingError
@@ -62,7 +62,7 @@ def load_resumable(directory: Path, config: Mapping[str, Any]) -> dict[str, Any]
     if not path.exists():
         return None
     state = load_checkpoint(path)
-    check_same_keys(directory, state.get("config", {}), config, RESUMABLE)
+    check_same_keys(directory, state.get("config", {}), config, RESUMABLE, PostTrainConfig)
     return state
 
 

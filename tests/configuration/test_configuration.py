@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import dataclasses
 import itertools
 import re
@@ -18,7 +19,14 @@ from agents.cli import main
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import compose, help_text, keys_of
 from agents.cli.main import expand_sweeps
-from agents.configuration.composition import changed, config_text, dotted_values, field_options
+from agents.configuration.composition import (
+    changed,
+    check_same_keys,
+    config_text,
+    dotted_values,
+    field_options,
+    plain_tree,
+)
 from agents.planning import list_planners
 from agents.planning.ledger import planner_settings
 from agents.post_training.settings import algorithm_settings, list_algorithms
@@ -183,6 +191,24 @@ def test_every_option_of_a_group_composes(tmp_path: Path) -> None:
 def test_wrong_values_in_python_are_named(make: Any, message: str) -> None:
     with pytest.raises((InvalidInputError, UnknownNameError), match=message):
         make()
+
+
+def test_keys_of_one_config_alone_refuse_no_resume() -> None:
+    """Another version may have another key; a setting of a reward is no key."""
+    now = plain_tree(PostTrainConfig(reward={"name": "clip", "high": 3}))
+    before = copy.deepcopy(now)
+    before["old"], before["guard"]["old"], before["guard"]["limits"]["old"] = 1, 2, 3
+    del before["seed"], before["algorithm"]["credit"], before["guard"]["limits"]["stack"]
+    check_same_keys(Path("x"), before, now, (), PostTrainConfig)
+    check_same_keys(Path("x"), now, before, (), PostTrainConfig)
+    for key, value, message in [
+        ("guard", {"limits": {"count": 9}}, r"\(guard.limits.count was 9, is None\)"),
+        ("algorithm", {"name": "nft"}, r"\(algorithm.name was 'nft', is 'ddpo_sf'\)"),
+        ("reward", {"name": "clip"}, r"\(reward.high was None, is 3\)"),
+    ]:
+        with pytest.raises(InvalidInputError, match=message):
+            check_same_keys(Path("x"), {**before, key: value}, now, (), PostTrainConfig)
+    check_same_keys(Path("x"), {**before, "algorithm": {"name": "nft"}}, now, ("algorithm",), PostTrainConfig)
 
 
 def test_numbers_of_numpy_are_numbers() -> None:
