@@ -94,12 +94,12 @@ class DDPOISSettings(DDPOSFSettings):
 
     Attributes:
         clip_epsilon: half-width of the clip of the probability ratio.
-        updates: optimiser steps per batch.
+        updates: optimiser steps per batch; one step is that of DDPO-SF.
     """
 
     name: str = "ddpo_is"
     clip_epsilon: Annotated[float, Limit(lambda value: 0 < value < 1, "must lie between 0 and 1")] = 1e-4
-    updates: Count = 1
+    updates: Count = 4
 
 
 @dataclass
