@@ -23,6 +23,7 @@ from agents.configuration.composition import (
     group_options,
     hint_of,
     layered,
+    named_options,
     parse_config,
     verbatim,
 )
@@ -181,7 +182,7 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
         raise InvalidInputError(f"--config-dir {config_dir}: no such folder")
     tree = read_config(config_file) if config_file else {}
     tree.pop("output", None)  # a run that is started again has a folder of its own
-    choices: dict[str, str] = _chosen(tree, fields, config_dir)
+    choices: dict[str, str] = named_options(tree, fields, config_dir)
     values: dict[str, Any] = {}
     adapter = ""
     for word in words:
@@ -211,7 +212,7 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
     replaced = {*choices, *(key for key in values if key in fields and fields[key].metadata.get("named"))}
     tree = verbatim({key: value for key, value in tree.items() if key not in replaced})
     made = by_hydra(command, config, choices, config_dir)
-    made |= by_hydra(command, config, _chosen(made, fields, config_dir), config_dir)
+    made |= by_hydra(command, config, named_options(made, fields, config_dir), config_dir)
     for key, value in values.items():
         made = _with(made, key, value, config, tree)
     settings: Any = build(config, layered(config, tree, made), command=command)
@@ -230,13 +231,6 @@ def read_config(path: str) -> dict[str, Any]:
         raise InvalidInputError(f"--config {path}: {error.strerror}; name the config.yaml of a run") from None
     except UnicodeDecodeError as error:
         raise CorruptFileError(f"--config {path} is not YAML ({error})") from error
-
-
-def _chosen(values: Mapping[str, Any], fields: Mapping[str, dataclasses.Field[Any]], config_dir: str) -> dict[str, str]:
-    """Options of groups that a file names by a text, as a word does."""
-    texts = {key: value for key, value in values.items() if isinstance(value, str) and key in fields}
-    groups = {key: value for key, value in texts.items() if dataclasses.is_dataclass(fields[key].default_factory)}
-    return {key: value for key, value in groups.items() if _is_option(fields[key], key, value, config_dir)}
 
 
 def _is_option(field: dataclasses.Field[Any], key: str, value: str, config_dir: str) -> bool:
@@ -263,19 +257,25 @@ def _is_text(hint: Any, value: str) -> bool:
     return str in options and not (value.startswith("[") and any(get_origin(option) is list for option in options))
 
 
-def _parsed(command: str, key: str, value: str) -> Any:
-    """The value of a word, read by Hydra."""
+def read_override(word: str) -> Any:
+    """A word as Hydra's parser reads it; None for a text that is none of its values."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.core.override_parser.types import Sweep
     from hydra.errors import HydraException
 
-    text = f"[{value}]" if "," in value and value[:1] not in _OPENING else value  # a,b is a list; to Hydra, a sweep
     try:
-        found: Any = OverridesParser.create().parse_override(f"{key}={text}").value()
-        is_sweep = any(isinstance(item, Sweep) for item in (found if isinstance(found, list) else [found]))
+        return OverridesParser.create().parse_override(word)
     except (HydraException, ValueError):
-        is_sweep = True
-    if is_sweep:
+        return None
+
+
+def _parsed(command: str, key: str, value: str) -> Any:
+    """The value of a word, read by Hydra."""
+    from hydra.core.override_parser.types import Sweep
+
+    text = f"[{value}]" if "," in value and value[:1] not in _OPENING else value  # a,b is a list; to Hydra, a sweep
+    override = read_override(f"{key}={text}")
+    found = None if override is None else override.value()
+    if override is None or any(isinstance(item, Sweep) for item in (found if isinstance(found, list) else [found])):
         raise InvalidInputError(f"{command}: a value cannot be read: {key}={value[:200]}")
     if isinstance(found, int) and abs(found) >= 2**63:
         raise InvalidInputError(f"{key}= has {len(str(abs(found)))} digits; whole numbers end at 2^63")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 import inspect
@@ -378,6 +377,18 @@ def check_option(folder: str, option: str, known: Sequence[str]) -> None:
         raise unknown_name(folder, option, known)
 
 
+def named_options(
+    values: Mapping[str, Any], fields: Mapping[str, dataclasses.Field[Any]], config_dir: str = ""
+) -> dict[str, str]:
+    """Options of groups among the values of fields, given by a text; refuses one that its group does not have."""
+    groups = [name for name in values if name in fields and fields[name].metadata.get("folder")]
+    texts = {name: values[name] for name in groups if not fields[name].metadata.get("named")}
+    chosen = {name: value for name, value in texts.items() if isinstance(value, str)}
+    for name, value in chosen.items():
+        check_option(name, value, field_options(fields[name], config_dir))
+    return chosen
+
+
 def composed(kind: Kind) -> Kind:
     """A config dataclass that is made in Python as on the command line.
 
@@ -403,13 +414,7 @@ def composed(kind: Kind) -> Kind:
 
 def _complete(kind: type, given: Mapping[str, Any], fields: Mapping[str, dataclasses.Field[Any]]) -> dict[str, Any]:
     """The values given in Python, over those of the recipe and of the named options."""
-    choices = {
-        name: value
-        for name, value in given.items()
-        if isinstance(value, str) and fields[name].metadata.get("folder") and not fields[name].metadata.get("named")
-    }
-    for name, value in choices.items():
-        check_option(name, value, field_options(fields[name]))
+    choices = named_options(given, fields)
     options = set(choices)
     if "recipe" in given and given["recipe"] != fields["recipe"].default and len(given) < len(fields):
         choices["recipe"] = given["recipe"]
@@ -436,13 +441,12 @@ def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: s
     if not config_dir and not sets:
         nodes = {key: _nodes(fields[key]).get(option) for key, option in choices.items()}
         if None not in nodes.values():  # nothing to compose
-            return copy.deepcopy(nodes)
+            return nodes
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    compose = _compose if config_dir else _compose_once
     try:
-        return copy.deepcopy(compose(kind, tuple(choices.items()), config_dir))
+        return _compose(kind, choices, config_dir)
     except (HydraException, OmegaConfBaseException) as error:
         if f"In 'recipe/{choices.get('recipe')}'" in str(error):
             raise InvalidInputError(
@@ -458,7 +462,7 @@ def _nodes(field: dataclasses.Field[Any], config_dir: str = "") -> dict[str, Any
     return {option: dict(value) for option, value in values.items() if option not in files}
 
 
-def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str = "") -> dict[str, Any]:
+def _compose(kind: type, choices: Mapping[str, str], config_dir: str) -> dict[str, Any]:
     """The composition of a config whose groups are empty but for the options chosen."""
     from hydra import compose, initialize_config_module
     from hydra.core.config_store import ConfigStore
@@ -476,14 +480,11 @@ def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str =
     defaults = ["_self_", *({path: None} for path in [*paths.values(), *recipe])]
     places = [f"file://{Path(config_dir).resolve()}"] if config_dir else []
     store.store(name="primary", node={"defaults": defaults, "hydra": {"searchpath": places}})
-    words = [f"{paths.get(key, key)}={option}" for key, option in choices]
+    words = [f"{paths.get(key, key)}={option}" for key, option in choices.items()]
     with initialize_config_module("configs", version_base="1.3"):
         made = OmegaConf.to_container(compose("primary", overrides=words), resolve=False)
     assert isinstance(made, dict)
     return {str(key): value for key, value in made.items()}
-
-
-_compose_once = functools.lru_cache(maxsize=256)(_compose)
 
 
 def layered(kind: type, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:

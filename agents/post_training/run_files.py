@@ -14,8 +14,7 @@ import numpy as np
 from agents.configuration.composition import check_same_keys
 from agents.post_training.settings import RESUMABLE, PostTrainConfig
 from agents.utils.checkpoints import load_checkpoint
-from scene_envs import files
-from scene_envs.errors import TrainingError
+from scene_envs.files import write_text
 from scene_envs.progress import Progress
 
 CHECKPOINT_NAME = "checkpoint.pt"
@@ -23,25 +22,6 @@ LOG_NAME = "log.csv"
 METRICS_NAME = "metrics.json"
 SCENES_NAME = "real_scenes.safetensors"
 BASE_SAMPLES_NAME = "base_samples.safetensors"
-
-
-def write_text(path: Path, text: str) -> None:
-    """Replace ``path`` atomically; a TrainingError leaves a file that was there before unchanged."""
-    writing(repr(str(path)), lambda: files.write_text(path, text))
-
-
-def writing(what: str, write: Callable[[], object]) -> None:
-    """Run ``write``, and turn its OSError or RuntimeError into a TrainingError that names ``what``."""
-    try:
-        write()
-    except (OSError, RuntimeError) as error:
-        raise TrainingError(f"could not write {what} ({error}); free some space and run the same again") from error
-
-
-def write_metrics(directory: Path, metrics: Mapping[str, Any]) -> None:
-    """Write ``metrics.json``; numbers that JSON lacks become null."""
-    path = directory / METRICS_NAME
-    writing(repr(str(path)), lambda: files.write_json(path, metrics))
 
 
 def write_log(directory: Path, history: Sequence[Mapping[str, float]]) -> None:

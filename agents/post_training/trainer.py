@@ -25,13 +25,11 @@ from agents.post_training.real_scenes import SceneBank, kept_base_samples, kept_
 from agents.post_training.rollouts import PromptSets, gathered_scenes, reward_figures, run_prompts, stream_seed
 from agents.post_training.run_files import (
     CHECKPOINT_NAME,
+    METRICS_NAME,
     draw_curve,
     load_resumable,
     run_progress,
     write_log,
-    write_metrics,
-    write_text,
-    writing,
 )
 from agents.post_training.settings import PostTrainConfig
 from agents.priors.prior import ScenePrior, check_object_count, no_text
@@ -44,7 +42,7 @@ from rewards import reward_label
 from scene_envs.arrays import resolve_device
 from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, TrainingError
-from scene_envs.files import claimed, sealed
+from scene_envs.files import claimed, sealed, write_json, write_text
 from scene_envs.scene import SceneBatch
 
 MAX_INVALID = 3
@@ -92,8 +90,8 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None, afte
         after: work of the caller that follows, in iterations; the time left that is shown includes it.
 
     Raises:
-        TrainingError: a gradient or a value of the prior is not finite, no reward was valid for too long, the disk is
-            full, or another process ended. The run can be resumed.
+        TrainingError, StorageError: a gradient or a value of the prior is not finite, no reward was valid for too long,
+            the disk is full, or another process ended. The run can be resumed.
         CorruptFileError: the checkpoint in the run directory is truncated.
         InvalidInputError: a setting is wrong, the directory holds a run of another configuration, or the processes
             do not divide the batch.
@@ -376,9 +374,8 @@ class PostTrainer:
                 "guard_ratio": self.guard.ratio,
             },
         }
-        path = self.directory / "prior"
         if self.processes.is_first:
-            writing(f"the prior {str(path)!r}", lambda: prior.save(path))
+            prior.save(self.directory / "prior")
 
     def _best(self) -> ScenePrior:
         """The prior that was kept last."""
@@ -391,8 +388,7 @@ class PostTrainer:
         first = reading.beyond and self.guard.over_limit_at == reading.iteration
         if batch is None or not reading.samples or not (reading.kept or first) or not self.processes.is_first:
             return
-        path = self.directory / f"{'guard_within' if reading.kept else 'guard_beyond'}.safetensors"
-        writing(f"the guard's samples {str(path)!r}", lambda: batch[:_PICTURED].save(path))
+        batch[:_PICTURED].save(self.directory / f"{'guard_within' if reading.kept else 'guard_beyond'}.safetensors")
 
     def save(self) -> None:
         """Write the resumable checkpoint, which is the same in all processes."""
@@ -433,7 +429,7 @@ class PostTrainer:
             "hold": self.learner.regularisation.summary(),
         }
         if self.processes.is_first:
-            write_metrics(self.directory, metrics)
+            write_json(self.directory / METRICS_NAME, metrics)
             draw_curve(
                 self.history,
                 self.directory / "curve.png",
