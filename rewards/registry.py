@@ -363,16 +363,12 @@ def _build(maker: Callable[..., Any], name: str, settings: dict[str, Any]) -> Re
     if not inspect.isclass(maker):
         return FunctionReward(maker, name, **settings)
     try:
-        inspect.signature(maker).bind(**settings)
-    except TypeError as error:
-        known = str(inspect.signature(maker)).split(" -> ")[0]
-        raise InvalidInputError(f"reward {name!r}: {error}; its settings are {known}") from error
-    try:
         reward = maker(**settings)
     except SceneEnvsError:
         raise
-    except (TypeError, ValueError) as error:  # a setting of another type than the class expects
-        raise InvalidInputError(f"reward {name!r} cannot be made with the settings {settings}: {error}") from error
+    except (TypeError, ValueError) as error:  # a setting that the class does not have, or of another type
+        known = str(inspect.signature(maker)).split(" -> ")[0]
+        raise InvalidInputError(f"reward {name!r}, made with {settings}: {error}; its settings are {known}") from error
     if not callable(reward):
         raise RewardError(f"reward {name!r}: {maker.__qualname__} has no __call__(batch, context) method")
     return reward  # type: ignore[no-any-return]

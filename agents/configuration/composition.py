@@ -534,6 +534,7 @@ class OptimizerSettings(Checked):
         lr: peak learning rate.
     """
 
+    place = "optimizer."
     name: Annotated[str, OneOf(OPTIMIZERS, "optimizer")] = "adamw"
     lr: Positive = 1e-3
 
@@ -548,6 +549,7 @@ class LoggerSettings(Checked):
         checkpoint_every: steps or iterations between resumable checkpoints.
     """
 
+    place = "logger."
     name: Annotated[str, OneOf(LOGGERS, "logger")] = "csv"
     checkpoint_every: Count = 10
 

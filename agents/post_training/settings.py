@@ -53,6 +53,7 @@ class AlgorithmSettings(Checked):
         scenes_per_prompt: number of scenes of a batch that share a prompt; advantages are computed within such a group.
     """
 
+    place = "algorithm."
     learning_rate: ClassVar[float] = 5e-5
     """Learning rate unless ``optimizer.lr`` names another."""
     regularisation_weight: ClassVar[float] = 0.5
@@ -312,6 +313,7 @@ class GuardLimits(Checked):
         classifier: the same for the accuracy of a classifier that tells samples from real scenes.
     """
 
+    place = "guard.limits."
     count: Nonnegative | None = None
     stack: Nonnegative | None = None
     category: Nonnegative | None = None
@@ -334,6 +336,7 @@ class GuardSettings(Checked):
         limits: limits of the figures of samples.
     """
 
+    place = "guard."
     every: Count = 5
     scenes: Count = 256
     limit: Unlimited = 1.5

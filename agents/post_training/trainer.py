@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 import time
 from contextlib import closing, nullcontext
@@ -15,7 +17,7 @@ import torch
 from tensordict import TensorDict
 from torch import Generator
 
-from agents.configuration.composition import config_text
+from agents.configuration.composition import check_same_keys, config_text
 from agents.configuration.prior_names import short_name
 from agents.post_training.algorithms.base import no_credit_per_object
 from agents.post_training.guard import Guard, GuardReading, SampleCheck, realism
@@ -23,17 +25,10 @@ from agents.post_training.learner import Learner, NonFiniteGradient
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.real_scenes import SceneBank, kept_base_samples, kept_scenes
 from agents.post_training.rollouts import PromptSets, gathered_scenes, reward_figures, run_prompts, stream_seed
-from agents.post_training.run_files import (
-    CHECKPOINT_NAME,
-    METRICS_NAME,
-    draw_curve,
-    load_resumable,
-    run_progress,
-    write_log,
-)
-from agents.post_training.settings import PostTrainConfig
+from agents.post_training.run_files import CHECKPOINT_NAME, METRICS_NAME, draw_curve, run_progress
+from agents.post_training.settings import RESUMABLE, PostTrainConfig
 from agents.priors.prior import ScenePrior, check_object_count, no_text
-from agents.utils.checkpoints import check_tensors, save_checkpoint
+from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
 from agents.utils.interrupts import finishing_steps
 from agents.utils.loggers import RunLogger
 from agents.utils.process_group import ProcessGroup, launched_processes
@@ -159,7 +154,10 @@ class PostTrainer:
         ``after`` the run, in iterations, counts in the time left that is shown.
         """
         config = self.config
-        state = load_resumable(self.directory, self.plain)
+        path = self.directory / CHECKPOINT_NAME
+        state = load_checkpoint(path) if path.exists() else None
+        if state is not None:
+            check_same_keys(self.directory, state.get("config", {}), self.plain, RESUMABLE, PostTrainConfig)
         self.prepare(reuse_scenes=state is not None)
         if state is not None:
             self._restore(state)
@@ -403,8 +401,14 @@ class PostTrainer:
         save_checkpoint(self.directory / CHECKPOINT_NAME, state)
 
     def _write_log(self) -> None:
+        """One row per iteration, with the union of the columns of all rows."""
+        text = io.StringIO()
+        columns = list(dict.fromkeys(name for row in self.history for name in row))
+        writer = csv.DictWriter(text, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.history)
         if self.processes.is_first:
-            write_log(self.directory, self.history)
+            write_text(self.directory / "log.csv", text.getvalue())
 
     def _restore(self, state: dict[str, Any]) -> None:
         for name in _STATE:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
-from scene_envs.files import replacing, with_digest, without_digest, write_json, write_text
+from scene_envs.files import read_json, replacing, with_digest, without_digest, write_json, write_text
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE_FEATURES
 from scene_envs.scene_types import SceneType
@@ -375,14 +375,9 @@ def read_metadata(path: str | os.PathLike[str]) -> DatasetInfo:
     file = Path(path) / METADATA if Path(path).is_dir() else Path(path)
     if not file.is_file():
         raise InvalidInputError(f"no {METADATA} at {str(file)!r}; a dataset folder holds one")
-    try:
-        metadata = json.loads(file.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CorruptFileError(f"{str(file)!r} is not valid JSON: {error}") from error
-    if isinstance(metadata, dict):
-        metadata = without_digest(metadata, file)
+    metadata = read_json(file)
     needed = ("model_paths", "normalizer_state")
-    missing = [key for key in needed if not isinstance(metadata, dict) or key not in metadata]
+    missing = [key for key in needed if key not in metadata]
     if missing:
         raise CorruptFileError(f"{str(file)!r} lacks the keys {missing}; a dataset's metadata needs {list(needed)}")
     for key in ("model_paths", "welded_object_model_paths"):

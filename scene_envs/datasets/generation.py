@@ -292,8 +292,8 @@ def _is_made(job: Job, features: int) -> bool:
         return False
     notes = read_notes(job.path)
     if notes["rows"] != job.size or "checksums" not in notes:
-        held = f"{notes['rows']} scenes{'' if 'checksums' in notes else ' without checksums'}"
-        raise CorruptFileError(f"{str(job.path)!r} holds {held}, expected {job.size}; delete it and run again")
+        held = f"holds {notes['rows']} scenes, expected {job.size} with checksums"
+        raise CorruptFileError(f"{str(job.path)!r} {held}; delete it and run again")
     for _ in read_rows(job.path, features):  # compares the checksums
         pass
     return True
