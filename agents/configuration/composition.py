@@ -438,7 +438,7 @@ def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: s
     if sets and len(sets) < len(choices):  # options go over the values of the sets
         options = {key: option for key, option in choices.items() if key not in sets}
         return layered(kind, by_hydra(command, kind, sets, config_dir), by_hydra(command, kind, options, config_dir))
-    if not config_dir and not sets:
+    if not sets and not (config_dir and choices):
         nodes = {key: _nodes(fields[key]).get(option) for key, option in choices.items()}
         if None not in nodes.values():  # nothing to compose
             return nodes
@@ -497,7 +497,8 @@ def layered(kind: type, first: Mapping[str, Any], second: Mapping[str, Any]) -> 
         if isinstance(now, Mapping) and (field.metadata.get("kinds") or field.metadata.get("named")):
             before = first.pop(field.name, {})
             before = {"name": before} if isinstance(before, str) else before
-            if isinstance(before, Mapping) and len({part["name"] for part in (before, now) if "name" in part}) < 2:
+            names = [part["name"] for part in (before, now) if isinstance(part, Mapping) and "name" in part]
+            if isinstance(before, Mapping) and names[:1] == names[-1:]:
                 first[field.name] = before
     return merged(first, second)
 

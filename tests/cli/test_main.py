@@ -353,7 +353,8 @@ REWARDS = {
     "{name:reachability,sides:3}": "made with {'sides': 3}: 'int' object is not iterable; its settings are",
     "{name:category_count,assets:3}": "made with {'assets': 3}: 'int' object is not iterable; its settings are",
     "{name:prompt_match,prompt:3}": "prompt_match: prompt=3 is not a text or null",
-    "{name:[clip]}": "a reward mapping needs 'name' (or '_target_'), a text, got {'name': ['clip']}",
+    "{name:[clip]}": "reward=['clip'] is neither a name",
+    "{name:[clip],high:3}": "a reward mapping needs 'name' (or '_target_'), a text, got {'name': ['clip'], 'high': 3}",
     "{name:clip}": "missing 1 required positional argument: 'reward'; its settings are",
     "./nowhere.py:few": "reward=: there is no file",
 }
