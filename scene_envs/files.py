@@ -154,8 +154,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        reason = f"{type(error).__name__}: {str(error)[:200]}"
-        raise CorruptFileError(f"{str(path)!r} is not valid JSON: {reason}") from error
+        raise CorruptFileError(f"{str(path)!r} is not valid JSON ({type(error).__name__}: {error!s:.200})") from error
     if not isinstance(content, dict):
         raise CorruptFileError(f"{str(path)!r} holds no mapping")
     return without_digest(content, path)

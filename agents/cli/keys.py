@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import inspect
+import re
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -269,7 +270,9 @@ def read_override(word: str) -> Any:
 
 
 def _parsed(command: str, key: str, value: str) -> Any:
-    """The value of a word, read by Hydra."""
+    """The value of a word, read by Hydra, but for numbers: its import takes as long as the rest of a listing."""
+    if re.fullmatch(r"-?(0|[1-9]\d{0,17})(\.\d+)?", value):
+        return float(value) if "." in value else int(value)
     from hydra.core.override_parser.types import Sweep
 
     text = f"[{value}]" if "," in value and value[:1] not in _OPENING else value  # a,b is a list; to Hydra, a sweep

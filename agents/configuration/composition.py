@@ -381,9 +381,8 @@ def named_options(
     values: Mapping[str, Any], fields: Mapping[str, dataclasses.Field[Any]], config_dir: str = ""
 ) -> dict[str, str]:
     """Options of groups among the values of fields, given by a text; refuses one that its group does not have."""
-    groups = [name for name in values if name in fields and fields[name].metadata.get("folder")]
-    texts = {name: values[name] for name in groups if not fields[name].metadata.get("named")}
-    chosen = {name: value for name, value in texts.items() if isinstance(value, str)}
+    texts = [name for name, value in values.items() if isinstance(value, str) and name in fields]
+    chosen = {name: values[name] for name in texts if fields[name].metadata.get("option")}
     for name, value in chosen.items():
         check_option(name, value, field_options(fields[name], config_dir))
     return chosen
@@ -415,7 +414,7 @@ def composed(kind: Kind) -> Kind:
 def _complete(kind: type, given: Mapping[str, Any], fields: Mapping[str, dataclasses.Field[Any]]) -> dict[str, Any]:
     """The values given in Python, over those of the recipe and of the named options."""
     choices = named_options(given, fields)
-    options = set(choices)
+    options = [*choices]
     if "recipe" in given and given["recipe"] != fields["recipe"].default and len(given) < len(fields):
         choices["recipe"] = given["recipe"]
         check_option("recipe", given["recipe"], group_options("recipe"))

@@ -68,7 +68,7 @@ def test_help_loads_nothing_heavy():
         "import sys; from agents.cli import main\n"
         f"for command in {list(COMMANDS)}: main([command, '--help'])\n"
         "main(['post-train', 'reward=clutter', 'algorithm=nft', 'prior=dimsum_table', '--help'])\n"
-        "main(['search', 'planner=mcts', 'mask=culprits', 'prompt=a cup', '--help'])\n"
+        "main(['search', 'planner=mcts', 'mask=culprits', 'prompt=a cup', 'count=3', '--help'])\n"
         "print({'torch', 'hydra', 'matplotlib', 'pybullet'} & set(sys.modules), file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

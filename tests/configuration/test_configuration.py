@@ -297,6 +297,10 @@ def test_a_number_is_no_boolean(value: str, tmp_path: Path) -> None:
     ("words", "key", "value"),
     [
         (["seed=${iterations}"], "seed", 60),
+        (["seed=0"], "seed", 0),
+        (["optimizer.lr=0.25"], "optimizer.lr", 0.25),
+        (["optimizer.lr=2"], "optimizer.lr", 2.0),
+        (["iterations=1_000"], "iterations", 1000),
         (["iterations=${algorithm.gradient_steps}"], "iterations", 8),
         (["optimizer={lr: 0.1}", "optimizer.lr=1e-4"], "optimizer.lr", 1e-4),
         (["optimizer.lr=1e-4", "optimizer={lr: 0.1}"], "optimizer.lr", 0.1),
