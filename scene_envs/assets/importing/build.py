@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -196,36 +196,28 @@ def _color(value: Any, where: str) -> Color:
     raise InvalidInputError(f"{where}: color must be [r, g, b] in 0..255 or '#rrggbb', got {value!r}")
 
 
-class Weight(NamedTuple):
-    """Mass properties of an asset, with remarks for the report."""
-
-    properties: MassProperties
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
-
-
 def weigh(
     given: MassProperties | None, parts: Sequence[ConvexPart], solid: MassProperties, entry: AssetEntry
-) -> Weight:
-    """Mass properties of an asset of these fine parts whose ``solid`` is given at 1 kg/m^3. Those ``given`` by the file
-    are kept where they are possible; an inertia of zeros is missing. A user's ``mass`` (kg) keeps the file's
-    distribution; a user's ``density`` (kg/m^3) fills the shape evenly.
+) -> tuple[MassProperties, tuple[str, ...], tuple[str, ...]]:
+    """Mass properties of an asset of these fine parts whose ``solid`` is given at 1 kg/m^3, with notes and warnings.
+    Those ``given`` by the file are kept where they are possible; an inertia of zeros is missing. A user's ``mass`` (kg)
+    keeps the file's distribution; a user's ``density`` (kg/m^3) fills the shape evenly.
     """
     mass = entry.mass
     if entry.density is not None:
-        return Weight(heavier(solid, entry.density), (), ())
+        return (heavier(solid, entry.density), (), ())
     if given is None or given.mass <= 0:
         known = "inertia computed from the shape"
         if mass is None:
             known, mass = f"mass and {known} at {DEFAULT_DENSITY:g} kg/m^3", DEFAULT_DENSITY * solid.mass
         why = "the file gives none" if given is None else f"the file gives a mass of {given.mass:g} kg"
-        return Weight(heavier(solid, mass / solid.mass), (f"{known}: {why}",), ())
+        return (heavier(solid, mass / solid.mass), (f"{known}: {why}",), ())
     if mass is None:
         found = given.mass / solid.mass
         if not _POSSIBLE[0] <= found <= _POSSIBLE[1]:
             reason = f"the file's {given.mass:g} kg would be {found:.3g} kg/m^3"
             text = f"mass and inertia recomputed at {DEFAULT_DENSITY:g} kg/m^3: {reason}"
-            return Weight(heavier(solid, DEFAULT_DENSITY), (), (text,))
+            return (heavier(solid, DEFAULT_DENSITY), (), (text,))
         mass = given.mass
     inertia, even = given.inertia * (mass / given.mass), heavier(solid, mass / solid.mass)
     notes: tuple[str, ...] = ()
@@ -233,8 +225,8 @@ def weigh(
         inertia, notes = even.inertia, ("inertia computed from the shape: the file gives none",)
     wrong = why_impossible(inertia, given.center_of_mass, parts, even)
     if wrong:
-        return Weight(even, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
-    return Weight(MassProperties(mass, given.center_of_mass, 0.5 * (inertia + inertia.T)), notes, ())
+        return (even, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
+    return (MassProperties(mass, given.center_of_mass, 0.5 * (inertia + inertia.T)), notes, ())
 
 
 def why_impossible(inertia: Array, center: Array, parts: Sequence[ConvexPart], computed: MassProperties) -> str:
@@ -345,11 +337,11 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     if entry.welded is None and (entry.mass is not None or entry.density is not None):
         static = False
     given = merged_inertial(model.inertials) if model.inertials else None
-    weight = weigh(given, parts, solid, entry)
-    properties = mass_properties(parts, 0.0) if static else weight.properties
-    if not static:
-        notes += weight.notes
-        warnings += weight.warnings
+    properties, remarks, faults = weigh(given, parts, solid, entry)
+    if static:
+        properties, remarks, faults = mass_properties(parts, 0.0), (), ()
+    notes += remarks
+    warnings += faults
     visual = join(*(mesh for shape in model.visuals or shapes for mesh in visual_of(shape, entry.color)))
     meshes = [shape for shape in (*model.visuals, *shapes) if shape.kind == "mesh"]
     notes += dict.fromkeys(
@@ -377,8 +369,8 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     )
     x, y, z = (shift + 0.0).tolist()
     density = 0.0 if static else properties.mass / solid.mass
-    remarks = tuple(notes), tuple(warnings)
-    return asset, AssetReport(entry.name, path, properties.mass, density, len(fine), (x, y, z), *remarks)
+    said = tuple(notes), tuple(warnings)
+    return asset, AssetReport(entry.name, path, properties.mass, density, len(fine), (x, y, z), *said)
 
 
 def _read(path: Path) -> Model:
@@ -424,17 +416,8 @@ def _upright(up: Axis) -> Array:
 
 def _diagonal(shapes: Sequence[Shape]) -> float:
     """Length (m) of the diagonal of the bounding box of all shapes."""
-    points = []
-    for shape in shapes:
-        if shape.kind == "mesh":
-            points += [np.asarray(mesh.vertices) for mesh in meshes_of(shape)]
-        else:
-            reach = sum(shape.size) if shape.kind == "capsule" else max(shape.size)
-            half = np.array(shape.size) / 2 if shape.kind == "box" else np.full(3, reach)
-            corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
-            points.append(corners @ shape.pose[:3, :3].T + shape.pose[:3, 3])
-    cloud = np.concatenate(points)
-    return float(np.linalg.norm(cloud.max(axis=0) - cloud.min(axis=0)))
+    meshes = [mesh for s in shapes for mesh in (meshes_of(s) if s.kind == "mesh" else visual_of(s, None))]
+    return float(np.linalg.norm(np.ptp(np.concatenate([mesh.bounds for mesh in meshes]), axis=0)))
 
 
 def _collide(

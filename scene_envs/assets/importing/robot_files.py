@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, fromstring
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,7 +24,6 @@ from scene_envs.assets.importing.mesh_files import (
     color_of,
     cut_polygons,
     find_mesh,
-    from_roll_pitch_yaw,
     heavier,
     merged_inertial,
     moved_inertial,
@@ -38,13 +37,7 @@ from scene_envs.assets.shapes import MassProperties
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 
 _Colors = Mapping[str, Color | None]
-_ZERO = (0.0, 0.0, 0.0)
 _TO_WORLD = "a joint holds it at `world`"
-_LEFT_OUT = ("nu actuators", "nsensor sensors", "ntendon tendons", "neq constraints", "nflex flexes", "nskin skins",
-             "nplugin plugins", "ngravcomp gravcomp")  # fmt: skip
-"""The sizes of a model in MuJoCo that count what an asset does not have."""
-_NOT_OF_USD = ("kinematicEnabled", "velocity", "angularVelocity", "restitution")
-"""Properties of UsdPhysics that an asset does not have."""
 
 
 def _unread(root: Element, kind: str) -> list[str]:
@@ -217,8 +210,8 @@ def _pose(element: Element | None, path: Path, where: str) -> Array:
         values = numbers(element.text, 7, path, f"pose of {where}", (0.0,) * 6 + (1.0,))
         return pose_of(values[:3], _from_quaternion(values[3:], path, where))
     values = numbers(element.text, 6, path, f"pose of {where}", (0.0,) * 6)
-    angles = np.radians(values[3:]) if _flag(element.get("degrees")) else values[3:]
-    return pose_of(values[:3], from_roll_pitch_yaw(angles))
+    turn = Rotation.from_euler("xyz", values[3:], degrees=_flag(element.get("degrees")))
+    return pose_of(values[:3], turn.as_matrix())
 
 
 def _from_quaternion(quaternion: Array, path: Path, where: str) -> Array:
@@ -347,14 +340,14 @@ def _placed(path: Path, base: Array, element: Element, where: str) -> Array:
     origin = element.find("origin")
     if origin is None:
         return base
-    xyz = numbers(origin.get("xyz"), 3, path, f"origin xyz of {where}", _ZERO)
+    xyz = numbers(origin.get("xyz"), 3, path, f"origin xyz of {where}", (0.0, 0.0, 0.0))
     if origin.get("rpy") and origin.get("quat_xyzw"):
         raise CorruptFileError(f"{path}: the origin of {where} has both rpy and quat_xyzw; keep one of them")
     if origin.get("quat_xyzw"):
         quaternion = numbers(origin.get("quat_xyzw"), 4, path, f"origin quat_xyzw of {where}")
         return base @ pose_of(xyz, _from_quaternion(quaternion, path, where))
-    rpy = numbers(origin.get("rpy"), 3, path, f"origin rpy of {where}", _ZERO)
-    return base @ pose_of(xyz, from_roll_pitch_yaw(rpy))
+    rpy = numbers(origin.get("rpy"), 3, path, f"origin rpy of {where}", (0.0, 0.0, 0.0))
+    return base @ pose_of(xyz, Rotation.from_euler("xyz", rpy).as_matrix())
 
 
 def read_mjcf(path: Path) -> Model:
@@ -369,17 +362,26 @@ def read_mjcf(path: Path) -> Model:
         spec = mujoco.MjSpec.from_file(str(path))
         for mesh in spec.meshes:
             check_file(path.parent / spec.meshdir / mesh.file)
+        for texture in spec.textures:  # none is read, whatever its size, and its file may be lost
+            texture.file, texture.cubefiles, texture.builtin = "", [""] * 6, mujoco.mjtBuiltin.mjBUILTIN_FLAT
+            texture.width = texture.height = 1
         model: Any = spec.compile()
     except ValueError as error:
         raise CorruptFileError(f"{path} cannot be read as MJCF: {' '.join(str(error).split())}") from error
     data: Any = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    root = _root_body(model, path)
+    roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
+    if len(roots) > 1:
+        names = ", ".join(repr(model.body(body).name) for body in roots)
+        raise InvalidInputError(f"{path} holds {len(roots)} bodies ({names}); an asset is one, so put each in a file")
+    if not roots and not model.ngeom:
+        raise InvalidInputError(f"{path} holds no <body> and no <geom>")
+    root = roots[0] if roots else 0  # the world itself where it holds all geoms
     bodies = [body for body in range(model.nbody) if root in (0, int(model.body_rootid[body]))]
     base = np.linalg.inv(pose_of(data.xpos[root], data.xmat[root].reshape(3, 3)))
     visuals: list[Shape] = []
     collisions: list[Shape] = []
-    notes = [] if model.ntex == 0 else [f"not read: {model.ntex} texture(s); what has one has the colour of the asset"]
+    notes = _unread(fromstring(spec.to_xml()), "MJCF")
     for geom in range(model.ngeom):
         name = f"geom {model.geom(geom).name or geom!r}"
         shape = _geom(model, geom, base @ pose_of(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)), path, name)
@@ -396,28 +398,18 @@ def read_mjcf(path: Path) -> Model:
         pose = base @ pose_of(data.xipos[body], data.ximat[body].reshape(3, 3))
         own = MassProperties(float(model.body_mass[body]), np.zeros(3), np.diag(model.body_inertia[body]))
         inertials.append(moved_inertial(pose, own))
-    counts = [(getattr(model, key), what) for key, what in map(str.split, _LEFT_OUT)]
-    notes += [f"not read: {count} {what}" for count, what in counts if count]
-    if (model.geom_friction[:, 0] != 1.0).any():
-        notes.append("not read: friction of geoms, because all objects of a scene have the same")
+    if ((model.geom_contype | model.geom_conaffinity) & ~1).any():
+        notes.append("not read: contype and conaffinity above 1, because all objects of a scene collide")
     free = [j for j in range(model.njnt) if model.jnt_type[j] == 0 and model.jnt_bodyid[j] == root]
     held = [j for j in range(model.njnt) if j not in free and model.jnt_bodyid[j] in bodies]
     if movable := [model.joint(j).name or f"joint {j}" for j in held]:
         notes.append(f"movable joints frozen at zero: {', '.join(movable)}")
+    drags = ("dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness") if free else ()
+    drag = [key[4:] for key in drags if getattr(model, key)[free[0]].any()]
+    notes += [f"not read: {name} of the free joint" for name in drag]
     if not free:
         notes.append("it has no free joint: it is welded (`welded: false` makes it free)")
     return Model(tuple(visuals), tuple(collisions), tuple(inertials), None if free else True, tuple(notes))
-
-
-def _root_body(model: Any, path: Path) -> int:
-    """The one body on the world; the world itself where it holds all geoms."""
-    roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
-    if len(roots) > 1:
-        names = ", ".join(repr(model.body(body).name) for body in roots)
-        raise InvalidInputError(f"{path} holds {len(roots)} bodies ({names}); an asset is one, so put each in a file")
-    if not roots and not model.ngeom:
-        raise InvalidInputError(f"{path} holds no <body> and no <geom>")
-    return roots[0] if roots else 0
 
 
 def _geom(model: Any, geom: int, pose: Array, path: Path, name: str) -> Shape | None:
@@ -464,14 +456,19 @@ def read_usd(path: Path) -> Model:
     bodies that no joint connects, or shapes that are sheared.
     """
     stage = open_stage(path)
-    from pxr import Usd, UsdGeom, UsdPhysics
+    from pxr import Gf, UsdGeom, UsdPhysics, UsdSkel
 
     if lost := [" ".join(str(error).split()) for error in stage.GetCompositionErrors()]:
         raise CorruptFileError(f"{path} refers to what cannot be loaded: {lost[0][:300]}")
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         raise InvalidInputError(f"{path} does not state `metersPerUnit`; set it, 1 for metres or 0.01 for centimetres")
     reading = _Stage(path, stage)
-    prims = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.IsActive()]
+    stage.SetEditTarget(stage.GetSessionLayer())
+    while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
+        for prim in instances:
+            prim.SetInstanceable(False)
+    UsdSkel.BakeSkinning(stage.Traverse(), Gf.Interval(0.0))
+    prims = list(stage.Traverse())
     found = [prim for prim in prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
     bodies = [prim for prim in found if UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get()]
     joints = [UsdPhysics.Joint(prim) for prim in prims if prim.IsA(UsdPhysics.Joint)]
@@ -480,8 +477,9 @@ def read_usd(path: Path) -> Model:
         raise InvalidInputError(f"{path} holds {len(found)} bodies ({names}); an asset is one, so put each in a file")
     if many := [prim.GetPath() for prim in prims if prim.IsA(UsdGeom.PointInstancer)]:
         raise InvalidInputError(f"{path}: {many[0]} is a point instancer, which is not read; make its instances prims")
+    lacking = ("kinematicEnabled", "velocity", "angularVelocity", "restitution")  # what an asset does not have
     for prim in prims:
-        values = [(name, prim.GetAttribute(f"physics:{name}")) for name in _NOT_OF_USD]
+        values = [(name, prim.GetAttribute(f"physics:{name}")) for name in lacking]
         reading.notes += [f"not read: {n} of {prim.GetPath()}" for n, value in values if value and np.any(value.Get())]
         if prim.IsA(UsdGeom.Gprim):
             reading.add(prim)
@@ -526,7 +524,7 @@ class _Stage:
         owner = next((p for p in _and_above(prim) if p.HasAPI(UsdPhysics.CollisionAPI)), None)
         collides = owner is not None and UsdPhysics.CollisionAPI(owner).GetCollisionEnabledAttr().Get() is not False
         image = UsdGeom.Imageable(prim)
-        drawn = image.ComputePurpose() in ("default", "render") and image.ComputeVisibility() != "invisible"
+        drawn = image.ComputePurpose() in ("default", "render") and image.ComputeVisibility(0.0) != "invisible"
         shape = self._mesh(prim, owner) if prim.IsA(UsdGeom.Mesh) else self._primitive(prim)
         if shape is None:
             self.notes.append(f"{prim.GetPath()} is a {prim.GetTypeName()}, which is left out")
@@ -537,14 +535,19 @@ class _Stage:
     def _mesh(self, prim: Any, owner: Any) -> Shape:
         """A mesh, a hull where its collider (of ``owner``) is one."""
         import trimesh
+        from pxr import UsdShade
 
         where, colors, (matrix, place) = str(prim.GetPath()), self._colors(prim), self._matrix(prim)
         names = ("points", "faceVertexIndices", "faceVertexCounts")
-        found, corners, counts = (np.array(prim.GetAttribute(name).Get() or ()) for name in names)
+        found, corners, counts = (np.array(prim.GetAttribute(name).Get(0.0) or ()) for name in names)
         corners, counts, points = corners.astype(int), counts.astype(int), found.reshape(-1, 3).astype(float)
         if counts.sum() != len(corners) or not len(corners) or not 0 <= corners.min() <= corners.max() < len(points):
             raise CorruptFileError(f"{self.path}: the faces of {where} do not fit to its points")
-        self.notes += [f"{where}: its holes are filled"] if prim.GetAttribute("holeIndices").Get() else []
+        self.notes += [f"{where}: its holes are filled"] if prim.GetAttribute("holeIndices").Get(0.0) else []
+        smooth = prim.GetAttribute("subdivisionScheme")
+        self.notes += [f"{where}: it is not subdivided"] * (smooth.HasAuthoredValue() and smooth.Get() != "none")
+        parts = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
+        self.notes += [f"not read: materials of parts of {where}"] if parts else []
         cut, polygons = cut_polygons(points, corners, counts)
         check_triangles(self.path, len(cut))
         inside_out = (prim.GetAttribute("orientation").Get() == "leftHanded") != (np.linalg.det(matrix) < 0)
@@ -584,7 +587,7 @@ class _Stage:
         """(N, 3) in 0..255 from the linear colours of a prim, N 0 without any."""
         from pxr import UsdGeom, UsdShade
 
-        values = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get() or ()
+        values = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor").ComputeFlattened(0.0) or ()
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
         for shader in material.GetPrim().GetChildren() if material else ():
             diffuse = shader.GetAttribute("inputs:diffuseColor")
@@ -636,7 +639,7 @@ def _one(colors: Any) -> Color | None:
 
 def _number(prim: Any, name: str) -> float:
     """A number of a prim; 0 where it has none."""
-    return float((prim.GetAttribute(name).Get() if prim and prim.HasAttribute(name) else None) or 0.0)
+    return float((prim.GetAttribute(name).Get(0.0) if prim and prim.HasAttribute(name) else None) or 0.0)
 
 
 def _and_above(prim: Any) -> list[Any]:

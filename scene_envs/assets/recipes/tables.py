@@ -1,9 +1,10 @@
-"""Assets whose shapes are a table, ``tables.json``: ware, furniture and games of boxes and solids of revolution.
+"""Assets whose shapes are a table, ``tables.json``: ware, furniture, toys and games of boxes and solids of revolution.
 
 An entry holds the facts of :func:`~scene_envs.assets.base.asset_recipe` and rows of shapes. The first key of a row
 names a function of :mod:`scene_envs.assets.shapes` and gives its first argument, the others are keywords; ``at`` lists
-the places (x, y, z) m of a box. ``coarse`` holds numbers of rows, for their parts, and lists of such numbers, for hulls
-of them; without it, the coarse parts are the fine ones. Colours are ``#rrggbb``, lengths m, angles rad.
+the places (x, y, z) m of a box, ``turn`` (3, 3) and ``to`` (3,) m are the pose of a lathed surface. ``coarse`` holds
+numbers of rows, for their parts, and lists of such numbers, for hulls of them; without it, the coarse parts are the
+fine ones. Colours are ``#rrggbb``, lengths m, angles rad.
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ from scene_envs.assets.shapes import (
     Patch,
     arc,
     box,
+    convex_hull,
     hull_of,
     join,
     lathe,
     lettering,
+    moved,
     painted_box,
     planks,
     ring,
@@ -49,7 +52,7 @@ def _painted(size: Any, color: Any, art: Any = None, **rest: Any) -> trimesh.Tri
     return painted_box(size, colors, patches, **rest)
 
 
-_PARTS = {"box": box, "solid": solid, "ring": ring, "rods": rods}
+_PARTS = {"box": box, "convex_hull": convex_hull, "solid": solid, "ring": ring, "rods": rods}
 _LOOKS = {"lathe": lathe, "tube": _tube, "planks": planks, "painted_box": _painted}
 
 
@@ -66,8 +69,10 @@ def _made(row: dict[str, Any], makers: dict[str, Any]) -> list[Any]:
     """What a row makes, at each of its places."""
     (name, first), *rest = _decoded(row).items()
     options = dict(rest)
+    turn, to = options.pop("turn", None), options.pop("to", None)
     bases = [{"base": place} for place in options.pop("at", ())] or [{}]
     found = [makers[name](first, **options, **base) for base in bases]
+    found = found if turn is None else [moved(mesh, turn, to) for mesh in found]
     return found[0] if isinstance(found[0], list) else found
 
 
