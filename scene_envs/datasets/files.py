@@ -112,7 +112,7 @@ def encode_shard(
 
 
 def _checksums(before: Sequence[int], scenes: NDArray[Any], prompt_sets: Sequence[tuple[str, ...]]) -> list[int]:
-    """CRC-32 of scenes and of prompts of all rows so far. Those of parquet leave out headers of pages and the footer."""
+    """CRC-32 of scenes and of prompts of all rows so far. Those of parquet leave out headers of pages and footer."""
     texts = "".join(f"{prompt}\0" for prompts in prompt_sets for prompt in (*prompts, ""))
     return [zlib.crc32(np.ascontiguousarray(scenes).data, before[0]), zlib.crc32(texts.encode(), before[1])]
 
