@@ -172,7 +172,7 @@ COMMANDS = {
 def main() -> None:
     """Read the words and run."""
     sys.path.append(str(Path(__file__).parents[1] / "examples"))
-    import_module("planners")  # registers uct, tree_over_steps and feynman_kac
+    import_module("planners")  # registers uct
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=COMMANDS)
     parser.add_argument("files", nargs="*")

@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -319,14 +319,17 @@ def page_part(package: str, name: str) -> str:
 
 @cache
 def page_template(package: str, name: str, *, trim_blocks: bool = False) -> Template:
-    """The template in a file of ``package``. It escapes all text; its filter ``png`` gives a file in base 64."""
-    from jinja2 import Environment, StrictUndefined
+    """The template in a file of ``package``, which may extend another one there. It escapes all text; its filter
+    ``png`` gives a file in base 64.
+    """
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
 
     environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=trim_blocks, keep_trailing_newline=not trim_blocks
-    )
+        autoescape=True, undefined=StrictUndefined, trim_blocks=trim_blocks, keep_trailing_newline=not trim_blocks,
+        loader=FunctionLoader(partial(page_part, package)),
+    )  # fmt: skip
     environment.filters["png"] = lambda path: base64.b64encode(path.read_bytes()).decode("ascii")
-    return environment.from_string(page_part(package, name))
+    return environment.get_template(name)
 
 
 def write_tensors(

@@ -35,9 +35,6 @@ class ReverseStep(Protocol):
     def entries(self) -> int:
         """Number of random variables of the step of each scene."""
 
-    def take(self, rows: Tensor) -> ReverseStep:
-        """The step of scenes ``rows`` (K,), which may come more than once."""
-
     def shifted(self, shift: Tensor) -> ReverseStep:
         """The step with the means of the first features moved by ``shift`` (B, N, F)."""
         ...
@@ -80,10 +77,6 @@ class GaussianStep(NamedTuple):
     mean: Tensor
     std: Tensor
     denoised: Tensor | None = None
-
-    def take(self, rows: Tensor) -> GaussianStep:
-        """The step of scenes ``rows`` (K,), which may come more than once."""
-        return self._replace(mean=self.mean[rows], denoised=None)
 
     def shifted(self, shift: Tensor) -> GaussianStep:
         """The step with the means of the first features moved by ``shift`` (B, N, F)."""
@@ -133,12 +126,6 @@ class MixedStep(NamedTuple):
     masked: Tensor | None = None
     denoised: Tensor | None = None
     groups: Tensor | None = None
-
-    def take(self, rows: Tensor) -> MixedStep:
-        """The step of scenes ``rows`` (K,), which may come more than once."""
-        masked = None if self.masked is None else self.masked[rows]
-        groups = None if self.groups is None else self.groups[rows]
-        return MixedStep(self.mean[rows], self.pose_std, self.probs[rows], self.random, masked, groups=groups)
 
     def shifted(self, shift: Tensor) -> MixedStep:
         """The step with the means of the first features moved by ``shift`` (B, N, F)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any
@@ -70,7 +70,9 @@ class GradientPlanner(PlannerSettings):
         Raises:
             InvalidInputError: the expansions of ``problem`` cannot be steered.
         """
-        steered = SteeredProblem(problem, self.name, self._guide)
+        steered = SteeredProblem(
+            problem, self.name, Guidance(self.weight if callable(self.weight) else overlap, self.strength, self.begin)
+        )
         return self._guided().make(self.children or 1).plan(steered, budget, progress)
 
     def _guided(self) -> PlannerSettings:
@@ -87,9 +89,6 @@ class GradientPlanner(PlannerSettings):
                 f"planner {self.name}: planner={self.planner!r} cannot be guided; give one of {known}"
             )
         return build(settings, keys, "planner.planner.")
-
-    def _guide(self, pairs: Sequence[tuple[Any, int]], values: Callable[[SceneBatch], Tensor]) -> Guidance:
-        return Guidance(self.weight if callable(self.weight) else overlap, self.strength, self.begin)
 
 
 def _is_guidable(settings: type[PlannerSettings]) -> bool:
@@ -140,13 +139,13 @@ def _sizes(library: AssetLibrary) -> Tensor:
     return torch.stack([*rows, torch.zeros(3)])
 
 
+@dataclass(frozen=True)
 class Guidance:
     """Gradient of a log-weight, times ``strength``, at the scenes that the network expects; none before ``begin``."""
 
-    role = "guide"
-
-    def __init__(self, weight: Weight, strength: float, begin: float) -> None:
-        self.weight, self.strength, self.begin = weight, strength, begin
+    weight: Weight
+    strength: float
+    begin: float  # share of the steps
 
     def __call__(self, step: int, steps: int, denoised: Callable[[], SceneBatch], std: Tensor) -> Tensor | None:
         """(B, N, 3) m, shift of the denoised translations; None at a step without guidance. Given x_t, x_0 is about

@@ -180,11 +180,11 @@ class SearchBudget:
 
 
 class SteeredProblem:
-    """A search problem whose expansions get ``steering``, which the planner called ``planner`` may change; an
-    InvalidInputError if the expansions of ``problem`` cannot be steered.
+    """A search problem whose expansions get ``steering``, the guide of the planner called
+    ``planner``; an InvalidInputError if the expansions of ``problem`` cannot be steered.
     """
 
-    def __init__(self, problem: Any, planner: str, steering: Any = None) -> None:
+    def __init__(self, problem: Any, planner: str, steering: Any) -> None:
         if "steering" not in inspect.signature(problem.expand_batch).parameters:
             takes = f"expand_batch of {type(problem).__name__} takes no steering="
             raise InvalidInputError(f"planner {planner} steers the denoising, and {takes}; choose another planner")

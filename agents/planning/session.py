@@ -26,7 +26,7 @@ from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.files import tensors_digest
 from scene_envs.scene import SceneBatch
 
-_MAGIC = b"scene-envs search 2\n"
+_MAGIC = b"scene-envs search 3\n"
 _HEAD = struct.Struct("<II")
 """Length and CRC-32 of a record."""
 

@@ -14,14 +14,9 @@ from agents.post_training.report import (
     PHYSICS_TIMEOUT,
     SAMPLE_SEED,
     Measured,
-    Page,
-    Picture,
-    Section,
-    Tile,
     draw_scenes,
     measure_prior,
     number_rows,
-    ready_section,
     write_report,
 )
 from agents.post_training.run_files import METRICS_NAME
@@ -91,7 +86,7 @@ def run_demo(
     }
     if left_out := _left_out(measured):
         metrics["left_out"] = left_out
-    write_report(directory / "report.html", _page(directory, results, measured))
+    _write_page(directory, results, measured)
     write_json(directory / METRICS_NAME, metrics)
     return metrics
 
@@ -104,60 +99,32 @@ class _Finished:
 
         self.config: dict[str, Any] = yaml.safe_load(read_sealed(directory / "config.yaml"))
         self.metrics: dict[str, Any] = json.loads((directory / METRICS_NAME).read_text(encoding="utf-8"))
-        self.goal = reward_label(self.config["reward"])
+        self.curve, self.goal = directory / "curve.png", reward_label(self.config["reward"])
         self.algorithm = self.config["algorithm"]["name"].upper().replace("_", "-")
 
 
-def _page(directory: Path, results: Mapping[str, _Finished], measured: Mapping[str, Measured]) -> Page:
-    """Content of the report; also writes its pictures to ``directory``."""
-    runs = " and ".join(
-        f"{run.goal} ({run.algorithm}, {run.metrics['iterations']} iterations)" for run in results.values()
-    )
-    before = measured["base"].figures
-    tiles = []
-    for name, run in results.items():
-        after, ratio = measured[name].figures, run.metrics["guard"]["ratio"]
-        tiles += [
-            Tile(f"{name}: objects per scene", f"{after['objects']:.1f}", f"from {before['objects']:.1f}"),
-            Tile(f"{name}: feasible as sampled", _share(after), f"of free objects, from {_share(before)}"),
-            Tile(f"{name}: held-out loss", f"{ratio:.2f}×", "of the base prior"),
-        ]
-    raw = draw_scenes({name: (part.raw, None) for name, part in measured.items()}, directory / "samples.png")
-    columns, ready, left_out = "Columns: " + ", ".join(measured), [], _left_out(measured)
+def _write_page(directory: Path, runs: Mapping[str, _Finished], measured: Mapping[str, Measured]) -> None:
+    """Write the report, and its pictures, to ``directory``."""
+    raw = {name: (part.raw, None) for name, part in measured.items()}
+    pictures, left_out = {"samples": draw_scenes(raw, directory / "samples.png")}, _left_out(measured)
     if "feasible" not in left_out:
-        shown = {name: (part.ready, part.is_ready) for name, part in measured.items() if part.ready is not None}
-        ready = [Picture(draw_scenes(shown, directory / "ready.png"), columns)]
-    count = int(before["scenes"])
-    sections = [
-        Section(
-            "As sampled",
-            "The first samples of each prior, untouched. The scenes of a row start from the same noise.",
-            [Picture(raw, columns)],
-        ),
-        ready_section(ready, left_out),
-        Section(
-            "Numbers", f"Means over {count} samples.", table=number_rows({n: m.figures for n, m in measured.items()})
-        ),
-        Section(
-            "The curves",
-            "Reward of each batch, and the held-out pretraining loss over that of the base prior.",
-            [Picture(directory / name / "curve.png", f"{name}: {run.goal}") for name, run in results.items()],
-        ),
-    ]
+        ready = {name: (part.ready, part.is_ready) for name, part in measured.items() if part.ready is not None}
+        pictures["ready"] = draw_scenes(ready, directory / "ready.png")
+    figures = {name: part.figures for name, part in measured.items()}
     scene_type = measured["base"].raw.scene_type.name
-    title = f"{scene_type.replace('_', ' ').capitalize()}, steered two ways"
-    lead = (
-        f"One prior, post-trained toward {runs}, each with the pretraining loss on real scenes as regularisation. "
-        f"All numbers are means over {count} fresh, seeded samples of each prior; none was selected."
+    write_report(
+        directory / "report.html",
+        "demo.html",
+        title=f"{scene_type.replace('_', ' ').capitalize()}, steered two ways",
+        runs=runs,
+        figures_of=figures,
+        count=int(figures["base"]["scenes"]),
+        left_out=left_out,
+        pictures=pictures,
+        rows=number_rows(figures),
+        settings={f"{name}: {key}": value for name, run in runs.items() for key, value in run.config.items()},
     )
-    settings = {f"{name}: {key}": value for name, run in results.items() for key, value in run.config.items()}
-    return Page(title, lead, tiles, sections, settings)
 
 
 def _left_out(measured: Mapping[str, Measured]) -> dict[str, str]:
     return {name: reason for part in measured.values() for name, reason in part.left_out.items()}
-
-
-def _share(figures: Mapping[str, float]) -> str:
-    share = figures.get("feasible_fraction")
-    return "–" if share is None else f"{share:.0%}"

@@ -19,7 +19,7 @@ from agents.post_training.guard import realism
 from agents.post_training.rollouts import PromptDeck, run_prompts, stream_seed
 from agents.post_training.run_files import CHECKPOINT_NAME, METRICS_NAME, SCENES_NAME
 from agents.post_training.settings import PostTrainConfig
-from agents.post_training.trainer import PostTrainResult, post_train
+from agents.post_training.trainer import post_train
 from agents.priors.prior import ScenePrior
 from agents.utils.checkpoints import load_checkpoint
 from agents.utils.process_group import ProcessGroup
@@ -39,15 +39,6 @@ PHYSICS_TIMEOUT = 300.0
 """Seconds for a chunk of scenes; long, so that a slow scene on a busy machine does not become invalid."""
 _GALLERY, _COLUMNS, _TILE = 12, 3, (400, 300)
 """Number of scenes of a gallery, number of its columns, and width and height of a scene in pixels."""
-_GUARD_LABELS = {
-    "loss": "held-out loss",
-    "sample_reward": "mean reward",
-    "count_distance": "distance of object counts (Wasserstein-1)",
-    "stack_distance": "distance of the tallest stacks (Wasserstein-1)",
-    "category_kl": "KL divergence of categories (nats)",
-    "classifier_accuracy": "accuracy of a classifier, samples against real scenes",
-}
-"""Labels of the figures of a check on the page."""
 _LABELS = {
     "reward": "the trained reward",
     "objects": "objects per scene (welded included)",
@@ -132,7 +123,21 @@ def post_train_and_compare(
     metrics |= {"stage_seconds": seconds, "num_steps": num_steps}
     if left_out := {**before.left_out, **after.left_out}:
         metrics["left_out"] = left_out
-    write_report(directory / "report.html", _page(result, before, after, metrics))
+    settings, reward_words = config.plain(), reward_label(config.plain()["reward"])
+    write_report(
+        directory / "report.html",
+        "run.html",
+        title=f"Steering {before.raw.scene_type.name.replace('_', ' ')} toward {reward_words}",
+        reward=reward_words,
+        algorithm=settings["algorithm"]["name"].upper().replace("_", "-"),
+        metrics=metrics,
+        before=before.figures,
+        after=after.figures,
+        left_out=left_out,
+        pictures=_draw_pictures(directory, before, after),
+        rows=rows_with_change(before.figures, after.figures),
+        settings=settings,
+    )
     write_json(directory / METRICS_NAME, metrics)
     return metrics
 
@@ -257,57 +262,20 @@ def draw_scenes(shown: Mapping[str, tuple[SceneBatch, Tensor | None]], path: Pat
     return path
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A PNG file that the page embeds, and one line below it."""
-
-    path: Path
-    caption: str
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A headline number as text: its name, its value, and the value that it is compared with."""
-
-    label: str
-    value: str
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class Section:
-    """A heading with one paragraph, pictures (in two columns) and a table, whose first row is the head."""
-
-    title: str
-    text: str = ""
-    pictures: Sequence[Picture] = ()
-    table: Sequence[Sequence[str]] = ()
-
-
-@dataclass(frozen=True)
-class Page:
-    """Content of a report: heading, a sentence or two on the run, tiles, sections, and the settings, folded."""
-
-    title: str
-    lead: str
-    tiles: Sequence[Tile] = ()
-    sections: Sequence[Section] = ()
-    settings: Mapping[str, Any] = field(default_factory=dict)
-
-
-def write_report(path: Path, page: Page) -> Path:
-    """Write ``page`` as one HTML file with styles and pictures inside, without script or link; text is escaped."""
+def write_report(path: Path, template: str, **content: Any) -> Path:
+    """Write ``template``, a page of this package that extends ``report.html``, with its ``content``: one HTML file with
+    styles and pictures inside, without script or link; text is escaped.
+    """
     from markupsafe import Markup
 
     style = Markup(page_part("agents.utils", "report.css"))
-    write_text(path, page_template("agents.post_training", "report.html").render(page=page, style=style))
+    write_text(path, page_template("agents.post_training", template).render(style=style, **content))
     return path
 
 
-def _page(result: PostTrainResult, before: Measured, after: Measured, metrics: Mapping[str, Any]) -> Page:
-    """Content of the report; also writes its pictures to the run folder."""
-    directory, settings = result.directory, result.config.plain()
-    pictures = {}
+def _draw_pictures(directory: Path, before: Measured, after: Measured) -> dict[str, Path]:
+    """The pictures of the page, by name; those of samples are drawn into the run folder."""
+    pictures = {"curve": directory / "curve.png"}
     for name, part in {"before": before, "after": after}.items():
         pictures[name] = draw_scenes({"": (part.raw, None)}, directory / f"{name}.png")
         if part.ready is not None:
@@ -316,84 +284,7 @@ def _page(result: PostTrainResult, before: Measured, after: Measured, metrics: M
     for name in ("guard_within", "guard_beyond"):
         if (path := directory / f"{name}.safetensors").exists():
             pictures[name] = draw_scenes({"": (SceneBatch.load(path), None)}, directory / f"{name}.png")
-    reward, algorithm = reward_label(settings["reward"]), settings["algorithm"]["name"].upper().replace("_", "-")
-    first, last, guard, hold = before.figures, after.figures, metrics["guard"], metrics.get("hold")
-    lead = (
-        f"{metrics['iterations']} iterations of {algorithm} on {reward}, with the pretraining loss on real scenes as "
-        f"regularisation. All numbers are means over {first['scenes']:.0f} fresh, seeded samples of each prior; none "
-        "was selected."
-    )
-    left_out = metrics.get("left_out", {})
-    judged = "left out" if "feasible" in left_out else "physics failed"
-    scored = "left out" if "reward" in left_out else "no scene could be scored"
-    tiles = [
-        _tile(f"reward: {reward}", "reward", first, last, scored),
-        _tile("objects per scene", "objects", first, last),
-        _tile("feasible as sampled", "feasible_objects", first, last, judged),
-        _tile("simulation-ready", "ready_objects", first, last, judged),
-        Tile("held-out loss", f"{guard['ratio']:.2f}×", f"of the base prior; limit {guard['limit']:g}×"),
-    ]
-    over = guard["over_optimised_from"]
-    verdict = f"{guard_verdict(guard)} The prior kept is that of iteration {guard['best_iteration']}."
-    if lost := metrics["reward"].get("invalid_scenes"):
-        verdict += f" The reward could not score {lost} of the scenes; log.txt says why."
-    caption = f"Mean {reward} of each batch, and the guard." + ("" if over is None else " Shaded: over-optimised.")
-    sections = [
-        Section("The curve", verdict, [Picture(directory / "curve.png", caption)]),
-        *([Section("What was held", hold["verdict"])] if hold and hold["measured"] is not None else []),
-        *guard_sections(guard, pictures),
-        Section(
-            "As sampled",
-            "The first samples of each prior from the same noise, untouched.",
-            [Picture(pictures["before"], "Before"), Picture(pictures["after"], "After")],
-        ),
-        ready_section(
-            [Picture(pictures[key], key[:-6].title()) for key in ("before_ready", "after_ready") if key in pictures],
-            left_out,
-        ),
-        Section("Numbers", table=rows_with_change(first, last)),
-    ]
-    title = f"Steering {before.raw.scene_type.name.replace('_', ' ')} toward {reward}"
-    return Page(title, lead, tiles, sections, settings)
-
-
-def ready_section(pictures: Sequence[Picture], left_out: Mapping[str, str]) -> Section:
-    """The section on samples after projection and settling, or why it is left out."""
-    text = (
-        "The same samples, projected out of penetration and settled. Red objects are not ready: they still move, "
-        "penetrate, or have left the workspace."
-    )
-    return Section("Simulation-ready", text if pictures else f"Left out: {left_out.get('feasible')}.", pictures)
-
-
-def guard_verdict(guard: Mapping[str, Any]) -> str:
-    """Result of the guard, in one sentence."""
-    over = guard["over_optimised_from"]
-    if over is None:
-        return "The guard found nothing beyond its limits."
-    found = next(check for check in guard["checks"] if check["iteration"] == over)
-    names = " and ".join(_GUARD_LABELS.get(name, name) for name in found["beyond"])
-    return f"At iteration {over} the {names} passed the limit: the run is over-optimised from there."
-
-
-def guard_sections(guard: Mapping[str, Any], pictures: Mapping[str, Path]) -> list[Section]:
-    """The guard's samples: a table, and pictures for the best checkpoint and for the first check beyond a limit."""
-    base = guard["base_samples"]
-    if not base:
-        return []
-    sampled = [check for check in guard["checks"] if check["samples"]]
-    best = next((check["samples"] for check in sampled if check["iteration"] == guard["best_iteration"]), base)
-    last = sampled[-1]["samples"] if sampled else base
-    rows: list[tuple[str, ...]] = [("", "base prior", "kept prior", "last check", "limit")]
-    for name, label in _GUARD_LABELS.items():
-        if name in base:
-            limit = guard["sample_limits"].get(name)
-            largest = "none" if limit is None else f"{base[name] + limit:.3g}"
-            rows.append((label, *(f"{figures[name]:.3g}" for figures in (base, best, last)), largest))
-    captions = {"guard_within": "Of the prior kept", "guard_beyond": "Of the first check beyond a limit"}
-    shown = [Picture(pictures[name], caption) for name, caption in captions.items() if name in pictures]
-    text = "Each check sampled from the same noise, and compared the samples with held-out real scenes."
-    return [Section("What the guard sampled", text, shown, table=rows)]
+    return pictures
 
 
 def number_rows(columns: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:
@@ -417,15 +308,6 @@ def _number(figures: Mapping[str, float], name: str) -> str:
         return f"{value:.1%}"
     error = figures.get(name + "_sem")
     return f"{value:.2f}" if error is None else f"{value:.2f} ± {error:.2f}"
-
-
-def _tile(label: str, name: str, before: Mapping[str, float], after: Mapping[str, float], failure: str = "") -> Tile:
-    if name not in before or name not in after:
-        return Tile(label, "–", failure)
-    change = _relative(before[name], after[name])
-    digits = ".1f" if max(abs(before[name]), abs(after[name])) >= 10 or name != "reward" else ".3g"
-    note = f"from {before[name]:{digits}}" + ("" if change is None else f", {change:+.0%}")
-    return Tile(label, f"{after[name]:{digits}}", note)
 
 
 def _relative(before: float, after: float | None) -> float | None:

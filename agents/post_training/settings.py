@@ -25,7 +25,7 @@ from agents.configuration.composition import (
     plain_tree,
 )
 from agents.utils.loggers import LOGGERS
-from scene_envs.envs.settings import PROMPT_SOURCES, check_guidance
+from scene_envs.envs.settings import PROMPT_SOURCES, WORKERS, check_guidance
 from scene_envs.errors import (
     BELOW_ONE,
     Checked,
@@ -328,8 +328,7 @@ class GuardSettings(Checked):
         every: iterations between checks.
         scenes: number of held-out real scenes.
         limit: largest held-out loss of a checkpoint that may be kept, as a ratio to that of the base prior.
-        action: what happens beyond a limit: ``report`` continues, ``stop`` ends the run, ``rollback`` returns to the
-            weights of the best checkpoint and continues with half the learning rate.
+        action: what happens beyond a limit: ``report`` continues, ``stop`` ends the run.
         samples: number of scenes that a check samples, always from the same noise, for the limits below; at most as
             many as ``scenes``. With fewer than 20, a check measures the loss alone.
         samples_every: iterations between checks that sample.
@@ -340,7 +339,7 @@ class GuardSettings(Checked):
     every: Count = 5
     scenes: Count = 256
     limit: Unlimited = 1.5
-    action: Annotated[str, OneOf(("report", "stop", "rollback"))] = "report"
+    action: Annotated[str, OneOf(("report", "stop"))] = "report"
     samples: Natural = 128
     samples_every: Count = 20
     limits: GuardLimits = nested(GuardLimits)
@@ -415,7 +414,7 @@ class PostTrainConfig(GuidanceKeys, SamplingKeys, EngineKeys, TrainingKeys, Prog
 
     iterations: Count = 60
     batch_size: Annotated[int, at_least(2)] = 48
-    workers: Any = 0
+    workers: Annotated[Any, WORKERS] = 0
     prior: str = "dimsum_table"
     reward: Any = named("object_count", "reward")
     prompt: Texts = None
@@ -434,10 +433,6 @@ class PostTrainConfig(GuidanceKeys, SamplingKeys, EngineKeys, TrainingKeys, Prog
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
-            raise InvalidInputError(
-                f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
-            )
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt)
         check_guidance(self.prompt, self.guidance)

@@ -6,9 +6,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +14,7 @@ from agents.configuration.composition import dotted
 from agents.configuration.prior_names import CONFIG_NAME
 from agents.priors.files import PriorFacts, read_config, write_config
 from scene_envs.errors import InvalidInputError
-from scene_envs.files import claimed, read_json, read_sealed, write_text
+from scene_envs.files import claimed, page_template, read_json, read_sealed, write_text
 
 if TYPE_CHECKING:
     from agents.priors.prior import ScenePrior
@@ -26,7 +24,6 @@ _TITLE = "# Prior `"
 """Start of the first line of a model card."""
 OWN_LICENSE = "MIT, as this package, whose grammars and assets made the scenes."
 """Licence of the data of priors that were trained on scenes of ``scene-envs generate``."""
-_OPTIMIZERS = {"adamw": "AdamW", "muon": "Muon and AdamW"}
 
 
 def package_prior(
@@ -137,119 +134,21 @@ def read_measures(path: str | os.PathLike[str]) -> tuple[dict[str, float], str |
 
 
 def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
-    """The model card, Markdown."""
-    card = facts.card
-    kind, strength = "A text-conditioned" if facts.text else "An unconditional", prior.config.physics_guidance
-    prompt = " prompt='A scene with 12 objects.'" if facts.text else ""
-    rows = {
-        "scene type": f"{facts.scene_type}: {prior.scene_type.num_assets} assets, {facts.slots} slots",
-        "network": _network(prior, facts),
-        "process": _process(prior, facts),
-        "prompts": facts.text or "none",
-        "data": _data(card),
-        "training": _training(card),
-        "post-training": _post_training(card),
-        "sampling": f"with physics guidance of strength {strength:g}; `physics_guidance=0` turns it off"
-        if strength
-        else "",
-        "licence of the data": str(card.get("license") or "not stated"),
-    }
-    table = "\n".join(["| | |", "|---|---|", *(f"| {key} | {text} |" for key, text in rows.items() if text)])
-    parts = [
-        f"{_TITLE}{name}`",
-        f"{kind} {facts.process} diffusion prior over scenes of type `{facts.scene_type}`.",
-        table,
-        "## How good it is",
-        _measured(prior, facts.measures),
-        "## What it is not good at",
-        str(card.get("limits") or "Not stated."),
-        "## Use",
-        f"```sh\nscene-envs sample prior={name}{prompt} count=16 project=true\n```",
-    ]
-    return "\n\n".join(parts) + "\n"
-
-
-def _measured(prior: ScenePrior, measures: Mapping[str, float]) -> str:
+    """The model card, Markdown, from the template ``card.md``."""
     from agents.evaluation import figure_table
 
-    if not measures:
-        return "Not measured."
-    steps = f" at {measures['num_steps']:.0f} steps" if "num_steps" in measures else ""
-    strength = measures.get("physics_guidance", 0.0)
-    guided = f", with physics guidance of strength {strength:g}" if strength else ""
-    if prior.config.physics_guidance and not strength:
-        guided = ", without physics guidance"
-    intro = f"{measures['scenes']:.0f} raw samples{steps}{guided}, none selected."
-    return f"{intro} *Real* is the same figure of real scenes: what a perfect sampler would score.\n\n" + figure_table(
-        measures
+    network, shown = prior.denoiser.network, ("hidden", "depth", "double_blocks", "single_blocks", "heads")
+    sizes = [f"{key} {value}" for key, value in vars(network.config).items() if key in shown]
+    if modules := getattr(network.config, "modules", ()):
+        sizes.append(f"modules {', '.join(module.name for module in modules)}")
+    return page_template("agents.priors", "card.md").render(
+        name=name,
+        prior=prior,
+        facts=facts,
+        network=type(network).__name__,
+        sizes=sizes,
+        table=figure_table(facts.measures),
     )
-
-
-def _network(prior: ScenePrior, facts: PriorFacts) -> str:
-    network = prior.denoiser.network
-    sizes = [
-        f"{field.name} {getattr(network.config, field.name)}"
-        for field in fields(network.config)
-        if field.name in ("hidden", "depth", "double_blocks", "single_blocks", "heads")
-    ]
-    modules = [module.name for module in getattr(network.config, "modules", ())]
-    sizes += [f"modules {', '.join(modules)}"] if modules else []
-    return (
-        f"{type(network).__name__}, {facts.parameters / 1e6:.1f} M parameters ({facts.megabytes:.1f} MB): "
-        f"{', '.join(sizes)}"
-    )
-
-
-def _process(prior: ScenePrior, facts: PriorFacts) -> str:
-    config = prior.config
-    text = f"{facts.process}, T = {config.num_timesteps}, schedule {config.schedule}, prediction {config.prediction}"
-    return f"{text}, categories {config.kernel}" if hasattr(config, "kernel") else text
-
-
-def _data(card: Mapping[str, Any]) -> str:
-    scenes = card.get("training_scenes")
-    parts = [str(card.get("data") or ""), f"{scenes:,} training scenes" if isinstance(scenes, int) else ""]
-    return "; ".join(part.rstrip(".") for part in parts if part)
-
-
-def _training(card: Mapping[str, Any]) -> str:
-    run, base = card.get("training") or {}, card.get("base") or {}
-    base_steps = f" ({base['trained_steps']:,} steps)" if base.get("trained_steps") else ""
-    parts = [
-        f"{card['trained_steps']:,} steps" + (f" of {card['batch_size']} scenes" if card.get("batch_size") else "")
-        if "trained_steps" in card
-        else "",
-        f"from `{base['name']}`{base_steps}" if base.get("name") else "",
-        _OPTIMIZERS.get(run.get("optimizer", ""), ""),
-        f"peak learning rate {run['learning_rate']:g}, EMA {run['ema']:g}" if "learning_rate" in run else "",
-        f"{card['seconds'] / 60:.0f} minutes" if card.get("seconds") else "",
-        str(card.get("machine") or ""),
-        f"held-out loss {card['heldout_loss']:.4g}" if card.get("heldout_loss") else "",
-        f"imported from {card['imported_from']}" if "imported_from" in card else "",
-    ]
-    return ", ".join(part.rstrip(".") for part in parts if part)
-
-
-def _post_training(card: Mapping[str, Any]) -> str:
-    run = card.get("post_training") or {}
-    if "sum" in run:
-        terms = " + ".join(f"{part['factor']:g} x ({_iterations(part)})" for part in run["sum"])
-        return f"the weights of `{run['base']}` + {terms}; a bracket is the change of all weights by a run"
-    if not run.get("iteration"):
-        return ""
-    base = f" from `{run['base']}`" if "base" in run else ""
-    return f"{_iterations(run)}{base}, held-out loss {run['guard_ratio']:.3f} times the base prior's"
-
-
-def _iterations(run: Mapping[str, Any]) -> str:
-    """Iterations, algorithm and reward of a run, or the name of the prior that it made."""
-    if "reward" not in run:
-        return f"`{run.get('name', 'a run without a card')}`"
-    algorithm = f" of {run['algorithm'].upper().replace('_', '-')}" if "algorithm" in run else ""
-    reward = run["reward"]
-    if isinstance(reward, Mapping) and isinstance(reward.get("rewards"), list):
-        reward = f"{reward.get('name', 'composite')} of {', '.join(map(str, reward['rewards']))}"
-    return f"{run.get('iteration', 0)} iterations{algorithm} toward `{reward}`"
 
 
 def _training_of(source: Path) -> dict[str, Any]:

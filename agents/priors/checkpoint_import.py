@@ -11,6 +11,7 @@ import os
 import pickle
 import re
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
@@ -32,31 +33,6 @@ _LOGGER = logging.getLogger(__name__)
 
 _AVERAGED, _RAW = "ema.averaged_model.", "model."
 _IGNORED = ("txt_encoder.", "discrete_diffusion.", "ema.optimization_step")
-
-_RULES: tuple[tuple[str, str], ...] = (
-    (r"continous_embedding\.in_layer\.", "pose_in.0."),
-    (r"continous_embedding\.out_layer\.", "pose_in.2."),
-    (r"object_model_emb\.", "category_in."),
-    (r"time_in\.in_layer\.", "time_in.0."),
-    (r"time_in\.out_layer\.", "time_in.2."),
-    (r"(scene_in|text_in)\.", r"\1."),
-    (r"double_blocks\.(\d+)\.scene_modality_embedding$", r"double_blocks.\1.scene.modality"),
-    (r"double_blocks\.(\d+)\.text_modality_embedding$", r"double_blocks.\1.text.modality"),
-    (r"double_blocks\.(\d+)\.(x|txt)_modulation\.lin\.", r"double_blocks.\1.<\2>.modulation."),
-    (r"double_blocks\.(\d+)\.(x|txt)_qkv_linear\.", r"double_blocks.\1.<\2>.qkv."),
-    (r"double_blocks\.(\d+)\.(x|txt)_qk_norm\.(query|key)_norm\.scale$", r"double_blocks.\1.<\2>.\3_norm.weight"),
-    (r"double_blocks\.(\d+)\.(x|txt)_post_att_linear\.", r"double_blocks.\1.<\2>.out."),
-    (r"double_blocks\.(\d+)\.(x|txt)_mlp\.", r"double_blocks.\1.<\2>.mlp."),
-    (r"single_blocks\.(\d+)\.modulation\.lin\.", r"single_blocks.\1.modulation."),
-    (r"single_blocks\.(\d+)\.(linear[12])\.", r"single_blocks.\1.\2."),
-    (r"single_blocks\.(\d+)\.norm\.(query|key)_norm\.scale$", r"single_blocks.\1.\2_norm.weight"),
-    (r"final_layer\.adaLN_modulation\.1\.", "final_modulation."),
-    (r"final_layer\.linear\.", "final."),
-    (r"to_continous_out\.in_layer\.", "pose_out.0."),
-    (r"to_continous_out\.out_layer\.", "pose_out.2."),
-    (r"to_logits\.", "logits_out."),
-)
-"""Patterns of the tensor names in the authors' checkpoints, and the names in this package."""
 
 
 def import_checkpoint(
@@ -245,8 +221,17 @@ def _fill(network: torch.nn.Module, tensors: dict[str, Tensor], file: str | os.P
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
 
 
+@cache
+def _rules() -> dict[str, str]:
+    """Patterns of the tensor names in the authors' checkpoints, and the names in this package."""
+    import yaml
+
+    found: dict[str, str] = yaml.safe_load(Path(__file__).with_name("checkpoint_names.yaml").read_text("utf-8"))
+    return found
+
+
 def _our_name(name: str) -> str | None:
-    for pattern, replacement in _RULES:
+    for pattern, replacement in _rules().items():
         ours, count = re.subn(f"^{pattern}", replacement, name)
         if count:
             return ours.replace("<x>", "scene").replace("<txt>", "text")

@@ -106,14 +106,14 @@ class ContinuousPrior(ScenePrior):
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
         observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, eta: float = 1.0,
-        hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
+        hook: Hook | None = None, closed: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D), as :meth:`ScenePrior.run_chain` describes it; there is no text, and ``guidance`` is not read.
 
         Observed entries have the noise of each level. Closed categories leave the arg-max at the end.
         """
         kept = None if observed is None else observed.entries(self.pose_width)
-        for step in range(first, len(table)):
+        for step in range(len(table)):
             if observed is not None and kept is not None:
                 noised = self.process.add_noise(observed.x, table.timesteps[step], draw_noise(x, noises))
                 x = self.clamp(torch.where(kept, noised, x))

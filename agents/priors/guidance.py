@@ -1,4 +1,4 @@
-"""Guidance of a reverse chain: hooks that watch or change its steps, and guidance by physics and by numbers of objects.
+"""Guidance of a reverse chain: hooks that change its steps, and guidance by physics and by numbers of objects.
 
 Guidance of poses by the claims of prompts is in :mod:`agents.priors.claim_guidance`.
 """
@@ -39,23 +39,12 @@ Hook = Callable[[int, Tensor, ReverseStep], ReverseStep]
 """``(step, x_t, reverse) -> reverse``: called at every step before x_{t-1} is drawn; may change the rows of
 ``reverse`` or shift it.
 """
-Start = tuple[int, Tensor]
-"""A step of a chain, and x_t (B, N, D) at this step. The chain begins there instead of at x_T."""
 Guide = Callable[[int, int, Callable[[], SceneBatch], Tensor], Tensor | None]
 """``(step, steps, denoised, std) -> shift``: moves the denoised translations by ``shift`` (B, N, 3), m.
 
-``denoised`` is as for :data:`Watch`; ``std`` (3,) is the standard deviation of the denoised translations, m, on their
-device. If the shift is None, the step is not changed. If a guide has a method ``acts(std)``, it is called only at the
-steps at which the method, which gets ``std`` on the CPU, returns True.
-"""
-Watch = Callable[[int, int, Callable[[], SceneBatch]], Tensor | None]
-"""``(step, steps, denoised) -> rows``: called at the steps of the denoising; chooses the scenes that continue.
-
-``denoised()`` gives the B scenes that the network expects at this step. ``rows`` (B,) is the index of the scene that
-each place continues with, such as ``[0, 0, 2]``; if it is None, every scene continues in its own place.
-
-If a watch has a method ``start(steps)``, the chain begins at the :data:`Start` that the method returns, if any. If a
-watch has a method ``see(step, steps, x)``, the method is called with x_t (B, N, D) at every step.
+``denoised()`` gives the B scenes that the network expects at this step; ``std`` (3,) is the standard deviation of the
+denoised translations, m, on their device. If the shift is None, the step is not changed. If a guide has a method
+``acts(std)``, it is called only at the steps at which the method, which gets ``std`` on the CPU, returns True.
 """
 
 

@@ -346,12 +346,12 @@ class MixedPrior(ScenePrior):
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
         observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, eta: float = 1.0,
-        hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
+        hook: Hook | None = None, closed: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D), as :meth:`ScenePrior.run_chain` describes it; observed entries carry no noise."""
         free = self.unconditional(len(x)) if text is None or guidance else None
         x = x if observed is None else observed.write(x)
-        for step in range(first, len(table)):
+        for step in range(len(table)):
             reverse: ReverseStep = self.transition(
                 x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta, closed=closed
             )

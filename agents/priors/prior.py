@@ -31,7 +31,6 @@ from agents.priors.guidance import (
     Hook,
     NumberGuidance,
     PhysicsGuidance,
-    Watch,
     physics_strength,
 )
 from scene_envs.arrays import constant_on, within_memory
@@ -524,19 +523,18 @@ class ScenePrior(nn.Module, ABC):
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
         observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, eta: float = 1.0,
-        hook: Hook | None = None, first: int = 0, closed: Tensor | None = None,
+        hook: Hook | None = None, closed: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) from x_T, with observed entries kept. No gradient passes.
 
         Args:
-            x: x_T (B, N, D), or the scenes at step ``first``.
+            x: x_T (B, N, D).
             table: the chain.
             noises: one generator for all scenes, or one per scene; None for torch's own.
             observed: entries that are kept.
             text: tokens (B, L, W) and mask (B, L) of the prompts; None without.
             guidance, eta: settings of :meth:`sample`.
             hook: hook that is called at every step.
-            first: step that the chain begins at.
             closed: (B, K) bool, categories that slots that are not observed do not take.
         """
 
@@ -561,20 +559,20 @@ class ScenePrior(nn.Module, ABC):
 
     def guidance_hook(
         self, table: StepTable, scenes: Callable[[Tensor], SceneBatch], moved: Tensor, prompts: Sequence[str] | None,
-        claim_guidance: float, physics_guidance: float, guide: Guide | None = None, watch: Watch | None = None,
+        claim_guidance: float, physics_guidance: float, guide: Guide | None = None,
     ) -> Hook | None:  # fmt: skip
-        """The hook of one chain under guidance; None if nothing watches or guides it.
+        """The hook of one chain under guidance; None if nothing guides it.
 
-        At a step it calls ``watch.see``, number guidance, ``guide``, claim guidance, physics guidance, and ``watch``.
+        At a step it calls number guidance, ``guide``, claim guidance and physics guidance.
 
         Args:
             table: the chain.
-            scenes: the B scenes of normalised x_0 (B, N, D), as watch and guides see them.
+            scenes: the B scenes of normalised x_0 (B, N, D), as guides see them.
             moved: (B, N, 1) bool, slots whose poses are denoised.
             prompts: one per scene; without prompts there is no claim guidance.
             claim_guidance: strength, 0 for none.
             physics_guidance: strength, 0 for none.
-            guide, watch: callables of the caller.
+            guide: guide of the caller.
         """
         scale, moved = (there.to(self.device) for there in (self.normalizer.scale[TRANSLATION], moved))
         guides: list[Guide] = [] if guide is None else [guide]
@@ -584,16 +582,13 @@ class ScenePrior(nn.Module, ABC):
             draw = NumberGuidance(prompts, self.scene_type)
         if physics_guidance:
             guides.append(PhysicsGuidance(physics_guidance, moved.squeeze(-1)))
-        if watch is None and draw is None and not guides:
+        if draw is None and not guides:
             return None
-        see = getattr(watch, "see", None)
         errors = [self.position_std(step, table) for step in range(len(table))] if guides else []
         there = torch.stack(errors).to(self.device) if guides else scale
 
         def hook(step: int, x: Tensor, reverse: ReverseStep) -> ReverseStep:
             estimate = reverse.denoised
-            if see is not None:
-                see(step, len(table), x)
             if draw is not None:
                 reverse = draw(x, reverse)
             if estimate is None:
@@ -604,8 +599,7 @@ class ScenePrior(nn.Module, ABC):
                 shift = each(step, len(table), denoised, there[step]) if acts is None or acts(errors[step]) else None
                 if shift is not None:
                     reverse = reverse.shifted(self.estimate(step, table)[0] * scale * shift.to(scale) * moved)
-            rows = None if watch is None else watch(step, len(table), denoised)
-            return reverse if rows is None else reverse.take(rows.to(x.device))
+            return reverse
 
         return hook
 
@@ -615,8 +609,7 @@ class ScenePrior(nn.Module, ABC):
     def inpaint(
         self, batch: SceneBatch, mask: Tensor, *, prompt: Prompt = None, guidance: float = 0.0,
         claim_guidance: float = 0.0, physics_guidance: float | None = None, num_steps: int = 50,
-        generators: Sequence[Generator] | None = None, seed: int = 0, watch: Watch | None = None,
-        guide: Guide | None = None,
+        generators: Sequence[Generator] | None = None, seed: int = 0, guide: Guide | None = None,
     ) -> SceneBatch:  # fmt: skip
         """Regenerate the masked entries, given the rest.
 
@@ -632,8 +625,6 @@ class ScenePrior(nn.Module, ABC):
             num_steps: denoiser evaluations, 1..T.
             generators: one per scene, so that a scene's result does not depend on its neighbours' noise.
             seed: seed of the generators, where none are given.
-            watch: called at every step; chooses the scenes that continue. A scene may be replaced only by one with the
-                same rows of ``batch`` and ``mask``.
             guide: moves the poses that are regenerated.
 
         Returns:
@@ -656,17 +647,13 @@ class ScenePrior(nn.Module, ABC):
         def scenes(x: Tensor) -> SceneBatch:
             return merge(batch, self.decode(x).to(batch.tensor.device), both)
 
-        hook = self.guidance_hook(table, scenes, both[..., :1], prompts, claim_guidance, strength, guide, watch)
+        hook = self.guidance_hook(table, scenes, both[..., :1], prompts, claim_guidance, strength, guide)
         text = None if prompts is None else self.encode_prompts(prompts)
         given, changed = batch.to(self.device), both.to(self.device)
         observed = Observed(self.encode(given), ~changed[..., 0], ~changed[..., 1])
-        first, x = 0, self.initial_from_noise(draw_noise(observed.x, generators))
-        begins = getattr(watch, "start", None)
-        start = None if begins is None else begins(len(table))
-        if start is not None:
-            first, x = start[0], start[1].to(x)
+        x = self.initial_from_noise(draw_noise(observed.x, generators))
         closed = self.closed_categories(given, changed)
-        x = self.run_chain(x, table, generators, observed, text, guidance, hook=hook, first=first, closed=closed)
+        x = self.run_chain(x, table, generators, observed, text, guidance, hook=hook, closed=closed)
         return scenes(x)
 
     def _check_prompts(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import inspect
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,12 +24,9 @@ _LOGGER = logging.getLogger(__name__)
 _SAME = 1e-4
 """Scenes are the same when their objects agree to within this (m)."""
 
-Steering = Callable[[Sequence[tuple["SearchState", int]], Callable[[SceneBatch], Tensor]], Any]
-"""``(pairs, values) -> watch``: makes the object that a prior's ``inpaint`` calls during the denoising of ``pairs``.
-
-``values`` gives Φ (B,) of scenes that are being denoised, 0 where the objective cannot score one. The object may have
-two methods: ``trace(row)`` returns the ``trace`` of that child, and ``first_step(steps)`` returns the step at which the
-denoising begins.
+Steering = Callable[[int, int, Callable[[], SceneBatch], Tensor], Tensor | None]
+"""``(step, steps, denoised, std) -> shift``: the ``guide`` of a prior's ``inpaint``, which moves scenes while they are
+denoised.
 """
 
 
@@ -46,7 +43,6 @@ class SearchState:
         value: Φ in [0, 1]; the parent's where ``valid`` is False.
         objective: Raw value of the objective; 0 where not valid.
         valid: Whether the objective could score this scene.
-        trace: Tensors from the object that steered the denoising, such as an intermediate scene; usually None.
 
     Two states are equal when they are the same node: same seed, path, scene and masks.
     """
@@ -59,7 +55,6 @@ class SearchState:
     value: float
     objective: float
     valid: bool
-    trace: Mapping[str, Tensor] | None = None
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, SearchState):
@@ -171,8 +166,6 @@ class SearchProblem:
     ) -> list[SearchState]:
         """The children of (state, action) pairs, generated as one batch and scored as one batch.
 
-        With ``steering`` the children of one parent depend on each other.
-
         Raises:
             InvalidInputError: an action is not legal in its state.
         """
@@ -184,14 +177,9 @@ class SearchProblem:
         parents = SceneBatch(torch.stack([state.scene for state, _ in pairs]), self.scene_type)
         masks = torch.stack([self.mask_of(state, action) for state, action in pairs])
         noises = [node_randomness(state.seed, path)[0] for (state, _), path in zip(pairs, paths, strict=True)]
-        watch = None if steering is None else steering(pairs, self._values)
-        children = self._inpaint(parents, masks, noises, watch)
+        children = self._inpaint(parents, masks, noises, steering)
         origins = [(state.seed, path, state.value) for (state, _), path in zip(pairs, paths, strict=True)]
-        states = self._score(children, origins)
-        trace = getattr(watch, "trace", None)
-        if trace is not None:
-            states = [replace(state, trace=trace(row)) for row, state in enumerate(states)]
-        return states
+        return self._score(children, origins)
 
     def legal_actions(self, state: SearchState) -> Sequence[int]:
         """The inpaintings of masks that have a slot; none at ``max_depth`` and where nothing is left to improve. One
@@ -250,17 +238,15 @@ class SearchProblem:
         return self.num_steps * (2 if self.prompting.guidance else 1)
 
     def _inpaint(
-        self, batch: SceneBatch, masks: Tensor, noises: list[torch.Generator], watch: Any = None
+        self, batch: SceneBatch, masks: Tensor, noises: list[torch.Generator], guide: Steering | None = None
     ) -> SceneBatch:
         guidance, reader = self.prompting.guidance, self.prompting.reader
-        spared = watch.first_step(self.num_steps) if hasattr(watch, "first_step") else 0
-        self.evaluations += self.nfe_per_scene // self.num_steps * (self.num_steps - spared) * len(batch)
+        self.evaluations += self.nfe_per_scene * len(batch)
         batch, masks = batch.to(self.device), masks.to(self.device)
         how: dict[str, Any] = {"num_steps": self.num_steps, "generators": noises}
-        if watch is not None:
-            role = getattr(watch, "role", "watch")
-            _check_takes(self.prior, role, "choose a planner that does not steer the denoising, such as evolution")
-            how[role] = watch
+        if guide is not None:
+            _check_takes(self.prior, "guide", "choose a planner that does not steer the denoising, such as evolution")
+            how["guide"] = guide
         if self.physics_guidance:
             _check_takes(self.prior, "physics_guidance", "leave physics_guidance=0")
         if self.physics_guidance or self._may_be_guided:
@@ -271,11 +257,6 @@ class SearchProblem:
             _check_takes(self.prior, "claim_guidance", "leave claim_guidance=0")
             how["claim_guidance"] = self.claim_guidance
         return reader.inpaint(batch, masks, prompt=self.prompt, guidance=guidance, **how).to("cpu")
-
-    def _values(self, batch: SceneBatch) -> Tensor:
-        """(B,) Φ of scenes; 0 where the objective cannot score one."""
-        score = self.scorer(batch, None if self.prompt is None else [self.prompt] * len(batch))
-        return torch.where(score.valid, score.value / self.scale, torch.zeros(())).clamp(0.0, 1.0).cpu()
 
     def _score(self, batch: SceneBatch, origins: Sequence[tuple[int, tuple[int, ...], float]]) -> list[SearchState]:
         """States of ``batch``, given each one's (seed, path, value of the parent)."""

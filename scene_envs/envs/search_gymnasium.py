@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,12 +25,7 @@ from scene_envs.envs.spaces import (
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
-if TYPE_CHECKING:
-    from scene_envs.render import LiveViewer
-
-
 Observation = dict[str, np.ndarray]
-_RENDER_MODES = ("human", "rgb_array")
 
 
 class SearchEnv(SpecMixin, gym.Env[Any, Any]):
@@ -108,7 +103,7 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     | `workers` | `0` | processes for physics in the objective; 0: in the calling process; `"ray"`: on a Ray cluster |
     | `physics` | `"auto"` | engine of motion: `bullet`, `mujoco`, `warp`; `auto`: Bullet if installed, else MuJoCo |
     | `device` | `"auto"` | device of the network: `cpu`, `cuda`; `auto`: of a given prior, else the GPU if any |
-    | `render_mode` | `None` | `"rgb_array"`: pictures, masked objects in red; `"human"`: a page in the browser |
+    | `render_mode` | `None` | `"rgb_array"`: pictures, masked objects in red |
     | `prompt` | `None` | text that all scenes should satisfy, for priors that read prompts; the objective gets it too |
     | `guidance` | `0.0` | weight of classifier-free guidance, which doubles the NFE; needs a prompt |
     | `claim_guidance` | `0.0` | strength of guidance to the numbers and places that the prompt gives; needs a prompt |
@@ -126,12 +121,11 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
     * v0: initial version.
     """
 
-    metadata = {"render_modes": list(_RENDER_MODES), "render_fps": 2}  # noqa: RUF012  (declared so by gym.Env)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012  (declared so by gym.Env)
 
     @takes(SearchSettings)
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
-        self.render_mode = check_render_mode(render_mode, _RENDER_MODES)
-        self._viewer: LiveViewer | None = None  # the page of "human", made at the first reset
+        self.render_mode = check_render_mode(render_mode)
         self.problem = problem = SearchProblem(**settings)
         self._chooses = "masks" in settings
         choice = spaces.Box(0, 1, (len(problem.mask_names), problem.slots), np.int8)
@@ -174,7 +168,6 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
             self._state = self.problem.root(tree_seed, options.get("scene"))
         self._best = self._state
         self._begun = False
-        self._show(self._state)
         return self._observe(self._state)
 
     def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -198,7 +191,6 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
             self._state = replace(parent, depth=parent.depth + 1, path=(*parent.path, int(action)))
         else:
             self._state = self.expand(parent, action)
-        self._show(self._state)
         observation, info = self._observe(self._state)
         terminated = self.problem.is_solved(self._state)
         truncated = not terminated and bool(self._end(self._state))
@@ -216,31 +208,14 @@ class SearchEnv(SpecMixin, gym.Env[Any, Any]):
         return ""
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """(H, W, 3) uint8 picture of the current scene, masked objects in red; None with ``"human"`` or no mode."""
-        if self.render_mode != "rgb_array":
+        """(H, W, 3) uint8 picture of the current scene, masked objects in red; None without a render mode."""
+        if self.render_mode is None:
             return None
         return picture(self.scene(), highlight=self.state.mask.unsqueeze(0))[0]
 
-    def _show(self, state: SearchState) -> None:
-        """Add a state to the page in the browser with mode ``"human"``."""
-        if self.render_mode != "human":
-            return
-        scene = self.scene(state)
-        if self._viewer is None:
-            from scene_envs.render import LiveViewer
-
-            self._viewer = LiveViewer(f"search of {scene.scene_type.name.replace('_', ' ')}")
-        masked = int((state.mask & ~scene.is_empty[0]).sum())
-        value = f"depth {state.depth}: objective {state.objective:.4g}"
-        empty = int(state.mask.sum()) - masked
-        self._viewer.show(scene, f"{value}, {masked} objects and {empty} empty slots masked")
-
     def close(self) -> None:
-        """Stop physics workers, if any, and close the viewer; its page remains."""
+        """Stop physics workers, if any."""
         self.problem.close()
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
 
     @property
     def state(self) -> SearchState:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium.error
@@ -92,11 +91,10 @@ def check_action(action: Any, shape: tuple[int, ...], axes: tuple[str, ...]) -> 
     return tensor
 
 
-def check_render_mode(render_mode: str | None, modes: Sequence[str] = ("rgb_array",)) -> str | None:
-    """``None`` or one of ``modes``."""
-    if render_mode is not None and render_mode not in modes:
-        known = ", ".join(map(repr, modes))
-        raise InvalidInputError(f"render_mode={render_mode!r} is not supported; use {known} or None")
+def check_render_mode(render_mode: str | None) -> str | None:
+    """``None`` or ``"rgb_array"``."""
+    if render_mode not in (None, "rgb_array"):
+        raise InvalidInputError(f"render_mode={render_mode!r} is not supported; use 'rgb_array' or None")
     return render_mode
 
 

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from scene_envs.render.pictures import gallery, observe, render
     from scene_envs.render.raster import Pinhole
     from scene_envs.render.stage import picture_camera
-    from scene_envs.render.viewer import LiveViewer, viewer_page, write_viewer
+    from scene_envs.render.viewer import viewer_page, write_viewer
 
-__all__ = ["LiveViewer", "Pinhole", "gallery", "observe", "picture_camera", "render", "viewer_page", "write_viewer"]
+__all__ = ["Pinhole", "gallery", "observe", "picture_camera", "render", "viewer_page", "write_viewer"]
 
 __getattr__ = lazy_names(__name__, __file__)

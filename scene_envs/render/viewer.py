@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import base64
 import os
-import tempfile
-import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import logger
 from numpy.typing import NDArray
 
 from scene_envs.assets import Asset, ConvexPart
@@ -38,7 +35,6 @@ def write_viewer(
     *,
     captions: Sequence[str] | None = None,
     title: str | None = None,
-    refresh: float | None = None,
 ) -> Path:
     """Write scenes as one HTML file that any browser with WebGL 2 draws, without a network; returns its path.
 
@@ -51,13 +47,11 @@ def write_viewer(
         path: File to write; its folder is made.
         captions: One line per scene; the number of objects by default.
         title: Heading of the page; the name of the scene type by default.
-        refresh: Seconds after which the page reads its file again, for a file that is still being written; None for
-            never.
 
     Raises:
         InvalidInputError: no scenes, or another number of captions.
     """
-    write_text(path, viewer_page(batch, captions=captions, title=title, refresh=refresh))
+    write_text(path, viewer_page(batch, captions=captions, title=title))
     return Path(path)
 
 
@@ -66,7 +60,6 @@ def viewer_page(
     *,
     captions: Sequence[str] | None = None,
     title: str | None = None,
-    refresh: float | None = None,
 ) -> str:
     """The page of :func:`write_viewer` as text.
 
@@ -82,13 +75,12 @@ def viewer_page(
     if len(captions) != len(batch):
         raise InvalidInputError(f"{len(batch)} scenes need {len(batch)} captions, got {len(captions)}")
     title = batch.scene_type.name.replace("_", " ") if title is None else title
-    data = {**_viewer_data(batch, captions), "refresh": refresh}
     return page_template(_WEB, "viewer.html").render(
         title=title,
         style=Markup(page_part(_WEB, "viewer.css")),
         scripts=Markup("\n".join(page_part(_WEB, name) for name in _SCRIPTS)),
         # escaped, so that it cannot end the HTML element that holds it
-        data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
+        data=htmlsafe_json_dumps(_viewer_data(batch, captions), separators=(",", ":"), allow_nan=False),
     )
 
 
@@ -187,37 +179,3 @@ def _text(values: NDArray[Any]) -> str:
     """The values as little-endian bytes in base64."""
     little = np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"))
     return base64.b64encode(little.tobytes()).decode("ascii")
-
-
-class LiveViewer:
-    """All scenes shown so far, in one page that the browser reads again every two seconds.
-
-    The page, with the heading ``title``, lies at ``path`` in a temporary folder and stays when the viewer is closed.
-    """
-
-    REFRESH = 2.0
-    """Seconds between two readings of the page."""
-
-    def __init__(self, title: str) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix="scene-envs-")) / "viewer.html"
-        self._title = title
-        self._scenes: list[SceneBatch] = []
-        self._captions: list[str] = []
-
-    def show(self, scene: SceneBatch, caption: str) -> None:
-        """Add a scene (a batch of one); the first one opens the browser."""
-        self._scenes.append(scene)
-        self._captions.append(caption)
-        self._write(self.REFRESH)
-        if len(self._scenes) == 1 and not webbrowser.open(self.path.resolve().as_uri()):
-            logger.warn(f"no browser was found; open {self.path} in one")
-
-    def close(self) -> None:
-        """Write the page a last time, without refresh; it stays in its folder."""
-        if self._scenes:
-            self._write(None)
-            self._scenes, self._captions = [], []
-
-    def _write(self, refresh: float | None) -> None:
-        batch = SceneBatch.concatenate(self._scenes)
-        write_viewer(batch, self.path, captions=self._captions, title=self._title, refresh=refresh)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import pickle
-import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
-from pathlib import Path
 from typing import Any
-from urllib.parse import urlparse
 
 import gymnasium as gym
 import numpy as np
@@ -341,32 +337,8 @@ def test_pictures_show_the_masked_objects_in_red(prior, free_objects):
     assert (env.render() != render(scene)[0]).any()
 
 
-def test_the_viewer_gets_each_state_and_opens_once(prior, free_objects, monkeypatch):
-    opened = []
-    monkeypatch.setattr("webbrowser.open", lambda address: opened.append(address) or True)
-    env = gym.make(ID, prior=prior, objective=free_objects, branching=3, max_depth=3, num_steps=2, render_mode="human")
-    env.reset(seed=0)
-    env.step(0)
-    env.step(1)
-    assert env.render() is None
-    (address,) = opened
-    path = Path(urlparse(address).path)
-    page = json.loads(re.search(r'id="data">(.*?)</script>', path.read_text(), re.DOTALL)[1])
-    assert [scene["caption"].split(":")[0] for scene in page["scenes"]] == ["depth 0", "depth 1", "depth 2"]
-    assert page["refresh"] == 2.0
-    env.close()
-    assert '"refresh":null' in path.read_text()
-
-
-def test_a_search_without_a_browser_says_where_the_page_is(prior, free_objects, monkeypatch):
-    monkeypatch.setattr("webbrowser.open", lambda address: False)
-    env = SearchEnv(prior=prior, objective=free_objects, num_steps=2, render_mode="human")
-    with pytest.warns(UserWarning, match=r"no browser was found; open .*viewer\.html"):
-        env.reset(seed=0)
-
-
 def test_an_unknown_render_mode_names_those_there_are(prior, free_objects):
-    with pytest.raises(InvalidInputError, match="use 'human', 'rgb_array' or None"):
+    with pytest.raises(InvalidInputError, match="use 'rgb_array' or None"):
         SearchEnv(prior=prior, objective=free_objects, render_mode="ansi")
 
 

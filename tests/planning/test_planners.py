@@ -94,10 +94,9 @@ def example() -> ModuleType:
     return load_example("planners")
 
 
-@pytest.mark.parametrize("name", ["uct", "tree_over_steps", "feynman_kac"])
-def test_planners_of_the_example_are_registered_and_search(example: ModuleType, name: str) -> None:
-    assert name in list_planners()
-    settings: dict[str, Any] = {"budget": 12, "branching": 3, "num_steps": 4, "seed": 3, "slots": 12, "planner": name}
+def test_the_planner_of_the_example_is_registered_and_searches(example: ModuleType) -> None:
+    assert "uct" in list_planners()
+    settings: dict[str, Any] = {"budget": 12, "branching": 3, "num_steps": 4, "seed": 3, "slots": 12, "planner": "uct"}
     found, again = (run_search(tiny_prior(), near_middle, baseline=False, **settings).search for _ in range(2))
     assert len(found.values) == 12
     assert found.best_value == max(found.values)
@@ -116,14 +115,6 @@ def test_uct_finds_what_brute_force_finds_and_a_known_optimum_sooner(example: Mo
     result = example.UCTPlanner(exploration=0.2, parallel=parallel).plan(problem, budget=80)
     assert result.best_path == target
     assert problem.batches[0] == parallel
-
-
-def test_a_tree_over_steps_begins_midway_and_counts_the_steps_it_takes(example: ModuleType) -> None:
-    result, env = plan(example.TreeOverStepsPlanner(children=2, stops=(0.5,), rounds=2))
-    assert len(result.values) == 14
-    assert 14 * 2 < env.nfe < 14 * 4  # of two rounds of one state the second begins at step 2 of 4
-    with pytest.raises(InvalidInputError, match="takes no steering="):
-        example.TreeOverStepsPlanner().plan(ToyTree(scrambled), budget=5)
 
 
 PLANNERS = [
@@ -272,13 +263,9 @@ def test_mcts_stops_where_nothing_is_masked_and_removes_what_is() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["evolution", "feynman_kac"])
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
-def test_the_budget_is_spent_to_the_last_evaluation_and_the_best_is_kept(
-    example: ModuleType, name: str, process: str
-) -> None:
-    resampled = example.FeynmanKacPlanner(particles=4, begin=0.0)
-    planner = resampled if name == "feynman_kac" else EvolutionPlanner(population=3, children=2, crossover=0.8)
+def test_the_budget_is_spent_to_the_last_evaluation_and_the_best_is_kept(process: str) -> None:
+    planner = EvolutionPlanner(population=3, children=2, crossover=0.8)
     result, env = plan(planner, process)
     assert len(result.values) == 14
     assert env.nfe == 14 * 4
@@ -354,54 +341,6 @@ def test_crossover_makes_other_scenes() -> None:
 # -- Feynman-Kac ----------------------------------------------------------------------------------
 
 
-def test_systematic_resampling_gives_every_particle_its_share(example: ModuleType) -> None:
-    weights = np.random.default_rng(0).dirichlet(np.full(7, 0.5))
-    grid = (np.arange(7000) + 0.5) / 7000
-    counts = np.array([np.bincount(example.systematic(3.0 * weights, uniform), minlength=7) for uniform in grid])
-    np.testing.assert_allclose(counts.mean(axis=0), 7 * weights, atol=1e-3)
-    assert bool((np.abs(counts - 7 * weights) < 1).all())
-    rows = example.systematic(weights, 0.3)
-    assert rows[rows].tolist() == rows.tolist()  # who goes on keeps its place
-    assert example.systematic(np.ones(5), 0.999).tolist() == [0, 1, 2, 3, 4]
-
-
-def test_particles_follow_the_tilted_distribution(example: ModuleType) -> None:
-    count, size, strength = 40_000, 0.1, 6.0
-    rng, place = np.random.default_rng(1), np.zeros(40_000)
-    particles = example.Particles(
-        ["a"] * count, {"a": np.random.default_rng(2)}, lambda values: values, 4, 0.0, strength
-    )
-    assert particles.at(5) == [0, 1, 2, 3]
-    for step in range(4):
-        place = place + size * rng.choice([-1.0, 1.0], count)
-        now = torch.from_numpy(place)
-        rows = particles(step, 5, lambda now=now: now)
-        place = place[rows.numpy()]
-    assert particles(4, 5, lambda: None) is None
-    # p(steps) exp(strength * place) of independent steps of ±size
-    assert place.mean() == pytest.approx(4 * size * math.tanh(strength * size), abs=0.005)
-    assert place.var() == pytest.approx(4 * size**2 / math.cosh(strength * size) ** 2, rel=0.05)
-
-
-def test_particles_give_way_to_those_of_their_own_parent(example: ModuleType) -> None:
-    rngs = {parent: np.random.default_rng(0) for parent in "ab"}
-    values = torch.tensor([0.0, 0.1, 1.0, 0.9, 0.0])
-    rows = example.Particles(list("aabab"), rngs, lambda _: values, 1, 0.0, 1000.0)(0, 2, lambda: None)
-    assert rows.tolist() == [3, 3, 2, 3, 2]
-
-
-@pytest.mark.parametrize("process", ["mixed", "continuous"])
-def test_without_strength_particles_are_greedy_repair(example: ModuleType, process: str) -> None:
-    steered, _ = plan(example.FeynmanKacPlanner(particles=3, strength=0.0), process)
-    greedy, _ = plan(GreedyPlanner(children=3), process)
-    assert steered.values == greedy.values
-
-
-def test_a_problem_that_cannot_be_steered_is_refused(example: ModuleType) -> None:
-    with pytest.raises(InvalidInputError, match="expand_batch of ToyTree takes no steering="):
-        example.FeynmanKacPlanner().plan(ToyTree(scrambled), budget=5)
-
-
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
 def test_denoised_scenes_become_what_is_inpainted(process: str) -> None:
     prior = tiny_prior(process=process)
@@ -410,17 +349,13 @@ def test_denoised_scenes_become_what_is_inpainted(process: str) -> None:
     mask[:, 4:] = True
     seen: list[SceneBatch] = []
 
-    def watch(step: int, steps: int, denoised: Any) -> torch.Tensor | None:
+    def guide(step: int, steps: int, denoised: Any, std: torch.Tensor) -> None:
         seen.append(denoised())
-        return torch.tensor([0, 0, 2]) if step == 2 else None
 
     plain = prior.inpaint(batch, mask, num_steps=4)
-    for scenes in (prior.inpaint(batch, mask, num_steps=4, watch=lambda *_: None), plain):
-        torch.testing.assert_close(scenes.tensor, plain.tensor, atol=0, rtol=0)
-    taken = prior.inpaint(batch, mask, num_steps=4, watch=watch)
+    guided = prior.inpaint(batch, mask, num_steps=4, guide=guide)
+    torch.testing.assert_close(guided.tensor, plain.tensor, atol=0, rtol=0)
     assert len(seen) == 4
     for scenes in seen:
         assert torch.equal(scenes.tensor[:, :4], batch.tensor[:, :4])
-    torch.testing.assert_close(seen[-1].tensor, taken.tensor, atol=1e-5, rtol=0)  # the last step is certain
-    assert torch.equal(taken.tensor[[0, 2]], plain.tensor[[0, 2]])
-    assert not torch.equal(taken.tensor[1], plain.tensor[1])
+    torch.testing.assert_close(seen[-1].tensor, plain.tensor, atol=1e-5, rtol=0)  # the last step is certain

@@ -1,19 +1,22 @@
-"""The guard's samples: paired noise, limits, the best checkpoint, rollback, and what the report shows."""
+"""The guard's samples: paired noise, limits, the best checkpoint, and what the report shows."""
 
 from __future__ import annotations
 
 import csv
+import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from PIL import Image
 
 from agents.evaluation import tallest_stacks
 from agents.evaluation.layouts import count_wasserstein
 from agents.post_training import post_train
-from agents.post_training.algorithms.forward_process import ForwardProcess
 from agents.post_training.guard import Guard, beyond
-from agents.post_training.report import guard_sections, guard_verdict
+from agents.post_training.report import write_report
 from agents.post_training.settings import GuardSettings
 from agents.post_training.trainer import PostTrainer
 from agents.priors.prior import ScenePrior
@@ -88,24 +91,6 @@ def test_checks_of_the_loss_alone_keep_nothing_where_the_guard_samples(tmp_path:
 
 
 @pytest.mark.slow
-def test_rollback_takes_the_best_checkpoint_again(tmp_path: Path) -> None:
-    """With no room for the loss, every check returns to the base prior at half the learning rate, four times."""
-    config = small_config(
-        tmp_path, iterations=30, lr=3e-2, **SAMPLES, **{"guard.limit": 1e-6, "guard.action": "rollback"}
-    )
-    result = post_train(config, prior=tiny_prior())
-    rates = [row["learning_rate"] for row in result.history]
-    assert result.metrics["iterations"] == 8
-    assert result.metrics["guard"]["rollbacks"] == 4
-    assert rates[2] == pytest.approx(rates[1] / 2)
-    assert len(SceneBatch.load(tmp_path / "guard_beyond.safetensors")) == 6
-    base = tiny_prior().state_dict()
-    made = PostTrainer(config, prior=tiny_prior())
-    made.learner.return_to(ScenePrior.load(tmp_path / "prior"))
-    assert all(torch.equal(base[name], tensor) for name, tensor in made.learner.prior.state_dict().items())
-
-
-@pytest.mark.slow
 def test_a_resumed_run_samples_and_keeps_the_same(tmp_path: Path) -> None:
     keys = {**SAMPLES, "iterations": 3, "algorithm": {"name": "nft", "expectation_lr": 1e-3}}
     whole = post_train(small_config(tmp_path / "a", **keys), prior=tiny_prior())
@@ -133,15 +118,26 @@ def test_a_resumed_run_samples_and_keeps_the_same(tmp_path: Path) -> None:
 def test_the_report_shows_figures_beside_the_base_prior(tmp_path: Path) -> None:
     config = small_config(tmp_path, iterations=2, **SAMPLES, **{"guard.limits.count": 2.0})
     guard = post_train(config, prior=tiny_prior()).metrics["guard"]
-    [section] = guard_sections(guard, {})
-    labels = [row[0] for row in section.table]
-    assert "KL divergence of categories (nats)" in labels
-    assert section.table[0] == ("", "base prior", "kept prior", "last check", "limit")
-    assert all(len(row) == 5 for row in section.table)
-    assert guard_verdict({"over_optimised_from": None}) == "The guard found nothing beyond its limits."
-    broken = {"over_optimised_from": 5, "checks": [{"iteration": 5, "beyond": ("category_kl",)}]}
-    assert "KL divergence" in guard_verdict(broken)
-    assert "iteration 5" in guard_verdict(broken)
+    picture = tmp_path / "a.png"
+    Image.new("RGB", (4, 4)).save(picture)
+
+    def page(guard: Mapping[str, Any]) -> str:
+        figures = {"scenes": 2.0, "objects": 3.0}
+        metrics = {"iterations": 2, "guard": guard, "hold": None, "reward": {"invalid_scenes": 0}}
+        return write_report(
+            tmp_path / "r.html", "run.html", title="t", reward="count", algorithm="NFT", metrics=metrics,
+            before=figures, after=figures, left_out={"feasible": "no"}, rows=[("", "before")], settings={},
+            pictures=dict.fromkeys(("curve", "before", "after"), picture),
+        ).read_text()  # fmt: skip
+
+    text = page({**guard, "over_optimised_from": None})
+    head = "".join(f"<th>{name}</th>" for name in ("", "base prior", "kept prior", "last check", "limit"))
+    assert head in text
+    assert re.search(r"<td>KL divergence of categories \(nats\)</td>(<td>[^<]+</td>){4}</tr>", text)
+    assert "The guard found nothing beyond its limits." in text
+    check = {"iteration": 5, "beyond": ("category_kl", "loss"), "samples": {}}
+    broken = page({**guard, "over_optimised_from": 5, "checks": [check]})
+    assert "At iteration 5 the KL divergence of categories (nats) and held-out loss passed the limit" in broken
 
 
 def test_the_guard_samples_no_more_than_it_compares_with() -> None:
@@ -184,22 +180,6 @@ def test_a_limit_on_stacks_needs_geometry(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_a_figure_that_the_base_prior_lacks_is_within_its_limit() -> None:
     assert beyond({"stack_distance": 3.0}, {}, {"stack_distance": 0.5}) == []
-
-
-@pytest.mark.slow
-def test_a_rollback_takes_every_part_of_the_algorithm_back(tmp_path: Path) -> None:
-    """The copy that learns the mean of own samples belongs to the policy that made them."""
-    keys = {"algorithm": {"name": "nft", "expectation_lr": 1e-2}, "guard.limit": 1e-6, "guard.action": "rollback"}
-    trainer = PostTrainer(small_config(tmp_path, **keys), prior=tiny_prior(process="mixed"))
-    trainer.run()
-    algorithm = trainer.learner.algorithm
-    assert isinstance(algorithm, ForwardProcess)
-    assert algorithm.expectation is not None
-    base = tiny_prior(process="mixed").state_dict()
-    for prior in (trainer.prior, algorithm.sampler, algorithm.expectation.prior):
-        assert all(torch.equal(base[name], tensor) for name, tensor in prior.state_dict().items())
-    assert not algorithm.expectation.optimizer.state
-    trainer.close()
 
 
 @pytest.mark.slow

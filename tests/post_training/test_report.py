@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from agents.post_training import learner as learned_rewards
 from agents.post_training import post_train_and_compare
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
-from agents.post_training.report import Page, Picture, Section, Tile, load_learned_rewards, measure_prior, write_report
+from agents.post_training.report import load_learned_rewards, measure_prior, write_report
 from agents.post_training.run_files import draw_curve
 from agents.post_training.trainer import post_train
 from agents.priors.prior import ScenePrior
@@ -70,8 +71,15 @@ def test_doctor_fits_one_screen(tmp_path: Path) -> None:
 def test_page_needs_nothing_but_itself_and_escapes_text(tmp_path: Path) -> None:
     picture = tmp_path / "a.png"
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(picture)
-    section = Section("<b>", "a & b", [Picture(picture, "one"), Picture(picture, "two")], [("x", "y"), ("1", "<2>")])
-    text = write_report(tmp_path / "r.html", Page("<t>", "l", [Tile("n", "1")], [section], {"k": "<v>"})).read_text()
+    figures = {name: {"scenes": 2.0, "objects": 3.0} for name in ("base", "<b>")}
+    run = SimpleNamespace(
+        goal="a & b", algorithm="NFT", curve=picture, metrics={"iterations": 1, "guard": {"ratio": 1}}
+    )
+    text = write_report(
+        tmp_path / "r.html", "demo.html", title="<t>", runs={"<b>": run}, figures_of=figures, count=2,
+        left_out={"feasible": "no"}, pictures={"samples": picture}, rows=[("x", "y"), ("1", "<2>")],
+        settings={"k": "<v>"},
+    ).read_text()  # fmt: skip
     assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)""", text)
     assert "http" not in text
     assert "<script" not in text

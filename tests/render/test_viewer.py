@@ -188,20 +188,6 @@ def test_the_screen_shows_a_shaded_picture_and_the_whole_table(browser, tmp_path
 
 
 @pytest.mark.slow
-def test_a_page_that_is_still_written_shows_its_last_scene_to_who_looks_there(coarse_browser, tmp_path):
-    browser = coarse_browser
-    page = write_viewer(scenes(2), tmp_path / "viewer.html", refresh=3600.0)
-    assert browser.open(page)["scene"] == "1"
-    for count, looked_at, shown in ((3, "1", "2"), (4, "0", "0")):
-        browser.run(f"sceneViewer.showScene({looked_at})")
-        browser.wait_for(f"window.location.hash.includes('scene={looked_at}')")
-        write_viewer(scenes(count), page, refresh=3600.0)
-        browser.send("Page.reload")
-        browser.wait_for(f"document.body && document.body.dataset.scenes === '{count}'")
-        assert browser.shown()["scene"] == shown
-
-
-@pytest.mark.slow
 def test_keys_and_the_list_change_what_is_drawn(coarse_browser, tmp_path):
     browser = coarse_browser
     browser.open(write_viewer(scenes(3), tmp_path / "viewer.html"))

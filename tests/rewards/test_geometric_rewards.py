@@ -14,7 +14,6 @@ import trimesh
 
 from rewards import (
     CategoryCount,
-    Clearance,
     Clutter,
     Penetration,
     RewardContext,
@@ -28,10 +27,10 @@ from rewards import (
 from scene_envs import SceneBatch, get_grammar, get_scene_type
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from tests.helpers.batch_reward import AboveTheMean
+from tests.helpers.examples import load_example
 
 COMPOSITES = {"clip", "product", "weighted_sum"}
 SHELF = [
-    "clearance",
     "clutter",
     "penetration",
     "stability",
@@ -148,7 +147,10 @@ def test_stability_falls_with_the_movement() -> None:
     assert score(Stability(), SceneBatch.empty("dimsum_table", 1)).value.item() == 0.0
 
 
-# -- clearance ---------------------------------------------------------------------------------------
+# -- clearance, of examples/scene_rewards.py ---------------------------------------------------------
+
+
+Clearance = load_example("scene_rewards").Clearance
 
 
 def games(*places: tuple[float, float, float], yaw: float = 0.0) -> SceneBatch:

@@ -300,14 +300,6 @@ Object.assign(document.body.dataset, { scenes: scenes.length });
 if (renderer) redraw();
 else showText();
 
-// A file that is still being written is read again. Who looks at its last scene is shown the new last one.
-if (data.refresh) {
-  const seen = Number(window.name); // which outlives a reload, also of a file
-  if (state.scene >= seen - 1) showScene(scenes.length - 1);
-  window.name = scenes.length;
-  setTimeout(() => window.location.reload(), 1000 * data.refresh);
-}
-
 // For scripts: the state, drawing at once, small pictures, and the slots seen in the canvas (row by row from below).
 window.sceneViewer = {
   state,
