@@ -80,6 +80,7 @@ PICTURES = {
     "category_count": Picture(FRUIT, "pantry_shelf", 0.0, "fruit", credited),
     "prompt_match": Picture(NAMED, "dimsum_table"),
     "reachability": Picture("reachability", "dimsum_table", 0.0, "not reached", without_credit),
+    "clearance": Picture("clearance", "dimsum_table", 0.01, "crowded", lambda b, o: o.object_flags["crowded"]),
     "discriminator": Picture(trained_discriminator, "dimsum_table", 0.01, "probability below 0.5", without_credit),
 }
 COUNT = 12

@@ -1,16 +1,16 @@
-"""Three rewards that a user adds: one with a frozen prior, one that depends on the batch, and one of free space.
+"""Two rewards that a user adds to ``post-train``: one with a frozen prior, and one that depends on the batch.
 
     scene-envs post-train --allow-local prior=dimsum_table \
         reward='{name: weighted_sum, rewards: [feasible_share, "./examples/scene_rewards.py:Diversity"]}'
 
 ``scene-envs check-reward --allow-local reward=./examples/scene_rewards.py:Realism`` tests the contract of one. The
-package has none of them. As a reward, the likelihood makes scenes lose objects: a likely scene is one with few of them
-(benchmarks/post_training.md, "Realism as reward"); there is no figure of a run toward diversity, or toward free space.
-The reward ``discriminator`` judges how real objects look. Meaningless scenes are diverse as well, so combine
-``Diversity`` with a reward such as ``feasible_share``.
+package has neither. As a reward, the likelihood makes scenes lose objects: a likely scene is one with few of them
+(benchmarks/post_training.md, "Realism as reward"); there is no figure of a run toward diversity. The reward
+``discriminator`` judges how real objects look. Meaningless scenes are diverse as well, so combine ``Diversity`` with a
+reward such as ``feasible_share``.
 
-``Realism`` costs 25 and 100 ms of one core per scene of 20 and of 60 objects, ``Clearance`` 2.7 and 5 ms, ``Diversity``
-below 0.5 and 0.61 ms (in batches of eight; all pairs are compared, so with 48 scenes about seven times as much).
+They cost 25 and below 0.5 ms of one core per scene of 20 objects, 100 and 0.61 ms per scene of 60 (``Diversity``: in
+batches of eight; all pairs are compared, so with 48 scenes about seven times as much per scene).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from agents import ScenePrior
 from rewards import RewardContext, RewardOutput
 from scene_envs import SceneBatch
 from scene_envs.envs.scoring import resolve_prior
-from scene_envs.errors import Checked, Count, InvalidInputError, Positive
+from scene_envs.errors import Checked, Count, InvalidInputError
 from scene_envs.scene import SceneObjects, cutoff, matching_distance
 
 
@@ -134,46 +134,3 @@ class Diversity:
         others = apart + np.diag(np.full(count, np.inf))
         nearest = torch.from_numpy(np.where(count > 1, others.min(axis=1, initial=1.0), 0.0)).float().to(device)
         return RewardOutput(value, terms={"nearest": nearest}, valid=torch.full((count,), count > 1, device=device))
-
-
-@dataclass(frozen=True)
-class Clearance(Checked):
-    """Mean gap of the free objects to their nearest neighbours, over the gap that is wanted: from 0 to 1.
-
-    The gap is the distance of the convex parts; it is 0 where objects touch or overlap. An object and what carries it,
-    directly or through others (``SceneBatch.supports``), are no neighbours. Objects outside the workspace score 0; so
-    does a scene without free objects.
-
-    Attributes:
-        wanted: gap from which an object has all the space it needs, m.
-    """
-
-    name: ClassVar[str] = "clearance"
-    place = "clearance: "
-    maximum: ClassVar[float] = 1.0
-    averages_objects: ClassVar[bool] = True
-    wanted: Positive = 0.03
-
-    def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
-        """``per_object`` (B, N) is the gap over ``wanted``, at most 1. Terms: ``smallest_gap``, m, at most
-        ``wanted``, and ``crowded_objects``, whose gap is smaller; they have the flag ``crowded``.
-        """
-        from scene_envs.physics.api import chosen_pool, run_kernel, stack, valid_rows
-
-        rows = run_kernel("gaps", batch, {"limit": self.wanted}, chosen_pool(context.pool, None))
-        counted = (batch.is_free & batch.in_workspace).cpu()
-        gap, free = stack(rows, batch, "gap"), batch.is_free.cpu().sum(dim=-1).clamp(min=1)
-        share = (gap / self.wanted).clamp(max=1.0) * counted
-        crowded = counted & (share < 1)
-        terms = {
-            "smallest_gap": gap.masked_fill(~counted, self.wanted).amin(dim=-1),
-            "crowded_objects": crowded.sum(dim=-1).float(),
-        }
-        device = batch.tensor.device
-        return RewardOutput(
-            value=(share.sum(dim=-1) / free).to(device),
-            per_object=share.to(device),
-            terms={name: term.to(device) for name, term in terms.items()},
-            valid=valid_rows(rows).to(device),
-            object_flags={"crowded": crowded.to(device)},
-        )

@@ -13,6 +13,7 @@ from rewards.base import (
     learned_parts,
 )
 from rewards.check import check_reward
+from rewards.clearance import Clearance
 from rewards.clutter import Clutter
 from rewards.composite import Clip, Product, WeightedSum
 from rewards.counts import CategoryCount, ObjectCount
@@ -37,6 +38,7 @@ from rewards.registry import (
 
 __all__ = [
     "CategoryCount",
+    "Clearance",
     "Clip",
     "Clutter",
     "FeasibleObjects",

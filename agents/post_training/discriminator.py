@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import torch
 from torch import Generator, Tensor, nn
@@ -15,7 +15,7 @@ from agents.evaluation.classifier import RESOLUTION
 from agents.evaluation.set_network import ObjectNetwork, SceneTokens, TypicalPlaces, blurred, scene_tokens
 from agents.utils.checkpoints import derived_generator, derived_seed
 from rewards import RewardContext, RewardOutput, register_reward
-from scene_envs.errors import Checked, Count, InvalidInputError, Limit
+from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 
 logger = logging.getLogger(__name__)
@@ -25,8 +25,7 @@ _MAX_REAL_SCENES = 1024
 
 
 @register_reward("discriminator")
-@dataclass(eq=False)
-class Discriminator(Checked):
+class Discriminator:
     """Mean probability, over the free objects, that an object is one of a real scene; from 0 to 1.
 
     A small network is trained online to separate the objects of real scenes from those of samples (Goodfellow et al.
@@ -35,7 +34,7 @@ class Discriminator(Checked):
     Untrained, it scores every object 0.5. A scene without free objects scores 0. Generated welded objects, such as the
     tables of rooms, are judged as well; they get credit, but do not change the value.
 
-    Attributes:
+    Args:
         learning_rate: learning rate of AdamW.
         steps: number of optimiser steps of an iteration.
         batch_size: number of real scenes, and of samples, of a step.
@@ -46,15 +45,24 @@ class Discriminator(Checked):
     """
 
     name: ClassVar[str] = "discriminator"
-    place = "discriminator: "
-    maximum: ClassVar[float] = 1.0
     averages_objects: ClassVar[bool] = True
-    learning_rate: Annotated[float, Limit(lambda rate: 0 < rate < 1, "must be a number between 0 and 1")] = 1e-3
-    steps: Count = 8
-    batch_size: Count = 48
-    memory: Count = 384
-    _model: _Model | None = field(default=None, init=False, repr=False)
-    _warned: bool = field(default=False, init=False, repr=False)
+
+    def __init__(self, learning_rate: float = 1e-3, steps: int = 8, batch_size: int = 48, memory: int = 384) -> None:
+        if isinstance(learning_rate, bool) or not isinstance(learning_rate, int | float) or not 0 < learning_rate < 1:
+            raise InvalidInputError(f"discriminator: learning_rate={learning_rate!r} must be a number between 0 and 1")
+        for name, number in (("steps", steps), ("batch_size", batch_size), ("memory", memory)):
+            if isinstance(number, bool) or not isinstance(number, int) or number < 1:
+                raise InvalidInputError(f"discriminator: {name}={number!r} must be a whole number of at least 1")
+        self.learning_rate, self.steps, self.batch_size, self.memory = learning_rate, steps, batch_size, memory
+        self._model: _Model | None = None
+        self._warned = False
+
+    def __repr__(self) -> str:
+        return "Discriminator()"
+
+    def maximum(self, slots: int, free_slots: int) -> float:
+        """The largest value, 1."""
+        return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Mean over the free objects. Term: ``free_objects``.

@@ -25,7 +25,7 @@ from agents.configuration.composition import (
     plain_tree,
 )
 from agents.utils.loggers import LOGGERS
-from scene_envs.envs.settings import PROMPT_SOURCES, WORKERS, check_guidance
+from scene_envs.envs.settings import PROMPT_SOURCES, check_guidance
 from scene_envs.errors import (
     BELOW_ONE,
     Checked,
@@ -414,7 +414,7 @@ class PostTrainConfig(GuidanceKeys, SamplingKeys, EngineKeys, TrainingKeys, Prog
 
     iterations: Count = 60
     batch_size: Annotated[int, at_least(2)] = 48
-    workers: Annotated[Any, WORKERS] = 0
+    workers: Any = 0
     prior: str = "dimsum_table"
     reward: Any = named("object_count", "reward")
     prompt: Texts = None
@@ -433,6 +433,10 @@ class PostTrainConfig(GuidanceKeys, SamplingKeys, EngineKeys, TrainingKeys, Prog
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
+            raise InvalidInputError(
+                f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
+            )
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt)
         check_guidance(self.prompt, self.guidance)

@@ -115,6 +115,11 @@ class RewardScorer:
     """
 
     def __init__(self, reward: Any, workers: int | str = 0, physics: str = "auto", *, prompted: bool = True) -> None:
+        number = isinstance(workers, int) and workers >= 0
+        if not number and workers != "ray":
+            raise InvalidInputError(
+                f"workers={workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
+            )
         self._score = resolve_reward(reward)
         facts = "depends_on_batch", "averages_objects", "counts_objects", "needs_prompts"
         self.depends_on_batch, self.averages_objects, self.counts_objects, needs_prompts = (

@@ -27,10 +27,6 @@ _PHYSICS_GUIDANCE = Limit(
     "must be a number from 0 to 1; 0 guides nothing, and 1 moves objects until they neither overlap nor float",
 )
 _SLOTS = Limit(lambda number: type(number) is int and 1 <= number <= 10**5, "must be a whole number from 1 to 100,000")
-WORKERS = Limit(
-    lambda workers: workers == "ray" or (type(workers) is int and workers >= 0),
-    "must be a number of processes, 0 for none, or ray for a Ray cluster",
-)
 MASKS = (
     "balanced", "blamed_or_empty", "culprits", "empty", "infeasible", "infeasible_or_empty", "off_prompt", "random",
 )  # fmt: skip
@@ -52,7 +48,7 @@ class EnvSettings(Checked):
     prior: Any = None
     num_steps: Annotated[int, _WHOLE] = 50
     slots: Annotated[int, _SLOTS] | None = None
-    workers: Annotated[int | str, WORKERS] = 0
+    workers: int | str = 0
     physics: str = "auto"
     device: str = "auto"
     prompt: Any = None

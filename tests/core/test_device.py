@@ -178,7 +178,7 @@ AT_THE_ENDS = {"mixed.py:initial_from_noise", "scene.py:is_welded"}
 
 
 @pytest.mark.parametrize(
-    "reward", ["clutter", "feasible_share", "object_count", "penetration",
+    "reward", ["clearance", "clutter", "feasible_share", "object_count", "penetration",
                "prompt_match", "stability"],
 )  # fmt: skip
 def test_rewards_score_on_the_device_of_the_scenes(

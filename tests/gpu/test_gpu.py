@@ -98,7 +98,7 @@ def test_guidance_corrects_as_on_the_cpu(strengths: dict[str, float], scenes: Sc
 
 
 @pytest.mark.parametrize(
-    "reward", ["clutter", "feasible_share", "object_count", "penetration",
+    "reward", ["clearance", "clutter", "feasible_share", "object_count", "penetration",
                "prompt_match", "reachability", "stability"],
 )  # fmt: skip
 def test_rewards_are_those_of_the_cpu(reward: str, scenes: SceneBatch) -> None:

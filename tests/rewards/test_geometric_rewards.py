@@ -14,6 +14,7 @@ import trimesh
 
 from rewards import (
     CategoryCount,
+    Clearance,
     Clutter,
     Penetration,
     RewardContext,
@@ -27,10 +28,10 @@ from rewards import (
 from scene_envs import SceneBatch, get_grammar, get_scene_type
 from scene_envs.errors import InvalidInputError, UnknownNameError
 from tests.helpers.batch_reward import AboveTheMean
-from tests.helpers.examples import load_example
 
 COMPOSITES = {"clip", "product", "weighted_sum"}
 SHELF = [
+    "clearance",
     "clutter",
     "penetration",
     "stability",
@@ -147,10 +148,7 @@ def test_stability_falls_with_the_movement() -> None:
     assert score(Stability(), SceneBatch.empty("dimsum_table", 1)).value.item() == 0.0
 
 
-# -- clearance, of examples/scene_rewards.py ---------------------------------------------------------
-
-
-Clearance = load_example("scene_rewards").Clearance
+# -- clearance ---------------------------------------------------------------------------------------
 
 
 def games(*places: tuple[float, float, float], yaw: float = 0.0) -> SceneBatch:
