@@ -106,6 +106,11 @@ class Neon(Algorithm):
         self.own.load_state_dict(prior.state_dict())
         self.updates = 0
 
+    def return_to(self, prior: ScenePrior) -> None:
+        """Begin a round with the weights of an earlier checkpoint."""
+        self.begin(prior)
+        self.optimizer.state.clear()
+
     def state(self) -> dict[str, Any]:
         """What a resumed run needs in addition to the prior."""
         return {"own": self.own.state_dict(), "optimizer": self.optimizer.state_dict(), "updates": self.updates}

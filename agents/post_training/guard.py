@@ -135,17 +135,19 @@ class Guard:
         return self.readings[-1].ratio if self.readings else 1.0
 
     @property
+    def best_ratio(self) -> float:
+        """Ratio of the best checkpoint; 1 when that is still the base prior."""
+        return next((r.ratio for r in self.readings if r.iteration == self.best_iteration), 1.0)
+
+    @property
     def over_limit_at(self) -> int | None:
         """Iteration of the first check beyond a limit, from which the reward counts as over-optimised, or None."""
         return next((r.iteration for r in self.readings if r.beyond), None)
 
     def summary(self) -> dict[str, Any]:
-        """Summary as JSON values: ratio of the kept checkpoint, which is 1 for the base prior, first check beyond a
-        limit, limits, and all checks.
-        """
-        best = next((r.ratio for r in self.readings if r.iteration == self.best_iteration), 1.0)
+        """Summary as JSON values: ratio of the kept checkpoint, first check beyond a limit, limits, and all checks."""
         return {
-            "ratio": best,
+            "ratio": self.best_ratio,
             "last_ratio": self.ratio,
             "limit": self.limit,
             "base_loss": self.base_loss,

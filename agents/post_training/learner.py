@@ -195,12 +195,22 @@ class Learner:
             self.optimizer.zero_grad(set_to_none=True)
             raise NonFiniteGradient(row)
         row["learning_rate"] = self.lr
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.lr
         self.optimizer.step()
         return row
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Take the weights of an earlier checkpoint, forget the optimiser's state, and halve the learning rate."""
+        self.prior.load_state_dict(prior.state_dict())
+        self.algorithm.return_to(self.prior)
+        self.lr *= 0.5
+        self.optimizer.state.clear()
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
         return {
+            "learning_rate": self.lr,
             "prior": self.prior.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "algorithm": self.algorithm.state(),
@@ -213,6 +223,7 @@ class Learner:
         """Inverse of :meth:`state`, after :meth:`begin_rewards`."""
         self.prior.load_state_dict(state["prior"])
         self.optimizer.load_state_dict(state["optimizer"])
+        self.lr = state["learning_rate"]
         self.algorithm.restore(state["algorithm"])
         self.regularisation.load_state_dict(state["regularisation"])
         for part, own in zip(self.learned, state["learned_rewards"], strict=True):

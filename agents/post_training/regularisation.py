@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -94,6 +94,12 @@ class Regularisation:
         self.state = adjust(self.state, self.settings.hold, ratio, iteration)
         if held and self.state.lost_at is not None:
             logger.warning("%s", self.verdict())
+
+    def return_to_checkpoint(self, ratio: float) -> None:
+        """Keep the weight, and forget how the held-out loss changed before a return to a checkpoint, whose held-out
+        loss is ``ratio`` times the base prior's.
+        """
+        self.state = replace(self.state, measured=ratio, slope=0.0)
 
     def verdict(self) -> str:
         """One sentence that says whether the target was held; empty without a target."""

@@ -328,7 +328,8 @@ class GuardSettings(Checked):
         every: iterations between checks.
         scenes: number of held-out real scenes.
         limit: largest held-out loss of a checkpoint that may be kept, as a ratio to that of the base prior.
-        action: what happens beyond a limit: ``report`` continues, ``stop`` ends the run.
+        action: what happens beyond a limit: ``report`` continues, ``stop`` ends the run, ``rollback`` returns to the
+            weights of the best checkpoint and continues with half the learning rate.
         samples: number of scenes that a check samples, always from the same noise, for the limits below; at most as
             many as ``scenes``. With fewer than 20, a check measures the loss alone.
         samples_every: iterations between checks that sample.
@@ -339,7 +340,7 @@ class GuardSettings(Checked):
     every: Count = 5
     scenes: Count = 256
     limit: Unlimited = 1.5
-    action: Annotated[str, OneOf(("report", "stop"))] = "report"
+    action: Annotated[str, OneOf(("report", "stop", "rollback"))] = "report"
     samples: Natural = 128
     samples_every: Count = 20
     limits: GuardLimits = nested(GuardLimits)

@@ -42,13 +42,15 @@ from scene_envs.scene import SceneBatch
 
 MAX_INVALID = 3
 """Consecutive batches without a valid reward after which a run stops."""
+_MAX_ROLLBACKS = 3
+"""Number of returns to the best checkpoint that a run may make; one more ends it."""
 _PROBED = 2
 """Real scenes on which the reward of a run is tried."""
 _PROBED_WITH_PROMPTS = 8
 """The same number in a run that uses the prompts of its real scenes."""
 _PICTURED = 6
 """Number of the guard's samples that are kept for the report."""
-_STATE = ("iteration", "invalid_streak", "seconds", "history")
+_STATE = ("iteration", "invalid_streak", "rollbacks", "seconds", "history")
 """Attributes of a trainer that are kept in a checkpoint."""
 
 
@@ -135,7 +137,7 @@ class PostTrainer:
             batch_size=config.batch_size, slots=config.slots, prompt=config.prompt, workers=config.workers,
             physics=config.physics, seed=config.seed,
         )  # fmt: skip
-        self.iteration = self.invalid_streak = 0
+        self.iteration = self.invalid_streak = self.rollbacks = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
         self.logger = RunLogger(config.logger.name if self.processes.is_first else "csv", self.directory)
@@ -179,9 +181,13 @@ class PostTrainer:
                 self.history.append({**row, "seconds": round(self.seconds, 2)})
                 last = self.iteration == config.iterations
                 sample = last or self.iteration % config.guard.samples_every == 0
-                if self.iteration % config.guard.every == 0 or last or (sample and config.guard.sampled > 0):
+                checked = self.iteration % config.guard.every == 0 or last or (sample and config.guard.sampled > 0)
+                if checked:
                     self._check(batch, sample=sample)
-                due = self.iteration % config.logger.checkpoint_every == 0
+                # a rollback reads prior/, which must be of the same iteration as the checkpoint
+                due = self.iteration % config.logger.checkpoint_every == 0 or (
+                    checked and config.guard.action == "rollback"
+                )
                 ending = self.processes.any(end.pending)
                 if due or last or self._stopped or ending:
                     self.save()
@@ -306,6 +312,8 @@ class PostTrainer:
 
     @property
     def _stopped(self) -> bool:
+        if self.config.guard.action == "rollback":
+            return self.rollbacks > _MAX_ROLLBACKS
         return self.config.guard.action == "stop" and self.guard.over_limit_at is not None
 
     def _start_guard(self) -> None:
@@ -328,6 +336,10 @@ class PostTrainer:
         figures = {f"guard_{name}": value for name, value in reading.samples.items()}
         self.history[-1] |= {"guard_loss": reading.loss, "guard_ratio": reading.ratio, **figures, **reading.realism}
         self._picture(reading)
+        if reading.beyond and self.config.guard.action == "rollback":
+            self.rollbacks += 1
+            self.learner.return_to(self._best())
+            self.learner.regularisation.return_to_checkpoint(self.guard.best_ratio)
 
     def _nothing_scored(self, what: str) -> TrainingError:
         return TrainingError(
@@ -417,7 +429,7 @@ class PostTrainer:
                 "best": self.guard.best_reward,
                 "invalid_scenes": round(invalid),
             },
-            "guard": self.guard.summary(),
+            "guard": {**self.guard.summary(), "rollbacks": self.rollbacks},
             "hold": self.learner.regularisation.summary(),
         }
         if self.processes.is_first:

@@ -50,7 +50,7 @@ RESUMABLE = {
     ),
     "post-train": Command(("post-train", _PRIORS[0], *_TRAINING, "algorithm.gradient_steps=1"), _TRAINED),
     "post-train nft": Command(
-        ("post-train", _PRIORS[1], *_TRAINING, "algorithm=nft", "guard.samples=2"), _TRAINED
+        ("post-train", _PRIORS[1], *_TRAINING, "algorithm=nft", "guard.samples=2", "guard.action=rollback"), _TRAINED
     ),
     "post-train hold": Command(("post-train", _PRIORS[0], *_TRAINING, "regularisation.hold=1.05"), _TRAINED),
     "search": Command(("search", _PRIORS[1], *_SEARCHING, "budget=24"), _SEARCHED),

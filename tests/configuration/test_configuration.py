@@ -184,7 +184,7 @@ def test_every_option_of_a_group_composes(tmp_path: Path) -> None:
         (lambda: PretrainConfig(optimizer="sgd"), "sgd"),
         (lambda: PretrainConfig(text=True), "text is a group of keys; give one of text.encoder"),
         (lambda: PostTrainConfig(rewrad="x"), "did you mean 'reward'"),
-        (lambda: PostTrainConfig(guard={"action": "halt"}), "unknown action 'halt'. Known: report, stop"),
+        (lambda: PostTrainConfig(guard={"action": "halt"}), "unknown action 'halt'. Known: report, rollback, stop"),
         (lambda: SearchConfig(planner={"name": "beem"}), "did you mean 'beam'"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The guard's samples: paired noise, limits, the best checkpoint, and what the report shows."""
+"""The guard's samples: paired noise, limits, the best checkpoint, rollback, and what the report shows."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from PIL import Image
 from agents.evaluation import tallest_stacks
 from agents.evaluation.layouts import count_wasserstein
 from agents.post_training import post_train
+from agents.post_training.algorithms.forward_process import ForwardProcess
 from agents.post_training.guard import Guard, beyond
 from agents.post_training.report import write_report
 from agents.post_training.settings import GuardSettings
@@ -88,6 +89,24 @@ def test_checks_of_the_loss_alone_keep_nothing_where_the_guard_samples(tmp_path:
     guard = trainer(tmp_path).guard
     reading = guard.check(tiny_prior(), 1, reward=1e9, sample=False)
     assert (reading.samples, reading.kept) == ({}, False)
+
+
+@pytest.mark.slow
+def test_rollback_takes_the_best_checkpoint_again(tmp_path: Path) -> None:
+    """With no room for the loss, every check returns to the base prior at half the learning rate, four times."""
+    config = small_config(
+        tmp_path, iterations=30, lr=3e-2, **SAMPLES, **{"guard.limit": 1e-6, "guard.action": "rollback"}
+    )
+    result = post_train(config, prior=tiny_prior())
+    rates = [row["learning_rate"] for row in result.history]
+    assert result.metrics["iterations"] == 8
+    assert result.metrics["guard"]["rollbacks"] == 4
+    assert rates[2] == pytest.approx(rates[1] / 2)
+    assert len(SceneBatch.load(tmp_path / "guard_beyond.safetensors")) == 6
+    base = tiny_prior().state_dict()
+    made = PostTrainer(config, prior=tiny_prior())
+    made.learner.return_to(ScenePrior.load(tmp_path / "prior"))
+    assert all(torch.equal(base[name], tensor) for name, tensor in made.learner.prior.state_dict().items())
 
 
 @pytest.mark.slow
@@ -180,6 +199,22 @@ def test_a_limit_on_stacks_needs_geometry(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_a_figure_that_the_base_prior_lacks_is_within_its_limit() -> None:
     assert beyond({"stack_distance": 3.0}, {}, {"stack_distance": 0.5}) == []
+
+
+@pytest.mark.slow
+def test_a_rollback_takes_every_part_of_the_algorithm_back(tmp_path: Path) -> None:
+    """The copy that learns the mean of own samples belongs to the policy that made them."""
+    keys = {"algorithm": {"name": "nft", "expectation_lr": 1e-2}, "guard.limit": 1e-6, "guard.action": "rollback"}
+    trainer = PostTrainer(small_config(tmp_path, **keys), prior=tiny_prior(process="mixed"))
+    trainer.run()
+    algorithm = trainer.learner.algorithm
+    assert isinstance(algorithm, ForwardProcess)
+    assert algorithm.expectation is not None
+    base = tiny_prior(process="mixed").state_dict()
+    for prior in (trainer.prior, algorithm.sampler, algorithm.expectation.prior):
+        assert all(torch.equal(base[name], tensor) for name, tensor in prior.state_dict().items())
+    assert not algorithm.expectation.optimizer.state
+    trainer.close()
 
 
 @pytest.mark.slow

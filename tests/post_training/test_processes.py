@@ -55,7 +55,7 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
     "awm": (
         "continuous",
         torch.float32,
-        {"guard": {"limit": 0.5, "every": 1, "scenes": 20, "samples": 20}, "bank_size": 30},
+        {"guard": {"action": "rollback", "limit": 0.5, "every": 1, "scenes": 20, "samples": 20}, "bank_size": 30},
     ),
     "guidance_distillation": (
         "mixed",

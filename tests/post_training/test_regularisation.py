@@ -6,6 +6,7 @@ import csv
 import logging
 import math
 from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -181,6 +182,19 @@ def test_a_target_that_was_not_reached_at_the_end_does_not_count_as_held() -> No
     assert "was not held at the end: guard 1.2" in regularisation.verdict()
     regularisation.observe(1.06, iteration=10)  # 0.2 of the way beyond
     assert regularisation.verdict() == "hold=1.05 was held: guard 1.06 at the last measurement."
+
+
+def test_a_rollback_does_not_count_as_a_fall_of_the_figure() -> None:
+    """The figure rises by 0.002 per iteration before and after the run returns to a checkpoint with 1.0."""
+    target, state = 1.05, HoldState()
+    for iteration in range(5, 105, 5):
+        state = adjust(state, target, 1 + 0.002 * iteration, iteration)
+    kept, forgotten = replace(state, measured=1.0, slope=0.0), state  # as Regularisation.return_to_checkpoint does
+    for iteration in range(105, 125, 5):
+        measured = 1 + 0.002 * (iteration - 100)
+        kept, forgotten = (adjust(one, target, measured, iteration) for one in (kept, forgotten))
+    assert kept.factor == pytest.approx(state.factor, rel=0.2)
+    assert forgotten.factor < 0.5 * state.factor  # as if training had lowered the figure
 
 
 PROCESSES = ("continuous", "mixed")

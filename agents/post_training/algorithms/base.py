@@ -66,6 +66,10 @@ class Algorithm(ABC):
         """Called after the last update of every batch."""
         return
 
+    def return_to(self, prior: ScenePrior) -> None:
+        """Called after the weights in training were replaced by those of ``prior``, an earlier checkpoint."""
+        return
+
     def state(self) -> dict[str, Any]:
         """State that a resumed run needs in addition to the weights in training."""
         return {}
@@ -95,6 +99,11 @@ class AveragedSampler(Algorithm):
     def end_iteration(self) -> None:
         """Move the copy towards the prior in training."""
         self.average.update(self.prior)
+        self.average.copy_to(self.sampler)
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Sample with the weights of ``prior``, and begin their average anew."""
+        self.average = WeightAverage(prior, self.average.decay, self.average.warm_up)
         self.average.copy_to(self.sampler)
 
     def state(self) -> dict[str, Any]:

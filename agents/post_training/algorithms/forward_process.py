@@ -271,6 +271,11 @@ class Expectation(nn.Module):
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 
+    def return_to(self, prior: ScenePrior) -> None:
+        """Take the weights of ``prior``, and forget the optimiser's state."""
+        self.prior.load_state_dict(prior.state_dict())
+        self.optimizer.state.clear()
+
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
         return {"weights": self.prior.state_dict(), "optimizer": self.optimizer.state_dict()}
@@ -332,6 +337,12 @@ class ForwardProcess(AveragedSampler):
             self.expectation.step()
         total, squares = processes.sum_numbers(total, squares)
         return BatchGradient(total, {"distance": squares**0.5})
+
+    def return_to(self, prior: ScenePrior) -> None:
+        """Sample with the weights of ``prior``; the expectation begins with them as well."""
+        super().return_to(prior)
+        if self.expectation is not None:
+            self.expectation.return_to(prior)
 
     def state(self) -> dict[str, Any]:
         """The state of the sampling policy, and that of the expectation."""
