@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain, product
+from typing import Any
 
 import numpy as np
 import torch
@@ -154,6 +155,7 @@ class _Hand:
         boxes = np.concatenate([middle + half, half - middle], axis=-1)
         struck, (grasp, *body) = [scene.last], self.parts  # in a heap, what was met last is met again
         likely = scene.meet(boxes[:, :, 1:], struck)[..., 0].tolist()
+        some: Any = None  # whether any part of the scene is near each part of the gripper
         begin, near, rows = 0, np.empty((0, 0, 0, 0), dtype=bool), None
         for p, t in np.ndindex(*tips.shape[:2]):
             pose = Transform(frames[t], tips[p, t])
@@ -166,8 +168,9 @@ class _Hand:
             if p >= begin + len(near):
                 begin, near = p, scene.meet(boxes[p : p + max(1, _PARTS // max(1, len(rows)))], rows)
                 near[:, :, 0, (rows < start) | (rows >= end)] = False
+                some = near.any(axis=-1).tolist()
             between, *others = near[p - begin, t]
-            is_between, *are_near = near[p - begin, t].any(axis=-1)
+            is_between, *are_near = some[p - begin][t]
             trial = zip(body, others, are_near, strict=True)
             if not is_between or any(scene.meets(part, rows[few].tolist()) for part, few, is_near in trial if is_near):
                 continue
