@@ -6,11 +6,12 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import cache
 from threading import Lock
+from typing import Any
 
 import fcl
 import numpy as np
 
-from scene_envs.arrays import Array
+from scene_envs.arrays import Array, Mask
 from scene_envs.assets.base import Asset, ConvexPart
 
 Parts = list[fcl.CollisionObject]
@@ -65,21 +66,24 @@ class Boxed:
 
     def __init__(self, parts: Parts, low: Array, high: Array) -> None:
         self._parts, self._bounds = parts, np.concatenate([low.T, -high.T])  # (6, P) m
-        self._last: Parts = []
+        self._result = fcl.CollisionResult()  # one for all, which saves half the time
+        self.last = 0  # row of the part that was met last
 
-    def meets(self, part: fcl.CollisionObject, low: Array, high: Array) -> bool:
-        """Whether a placed part in the box from ``low`` (3,) to ``high`` (3,) touches or overlaps any of these."""
-        result = fcl.CollisionResult()  # one for all, which saves half the time
-        box = np.concatenate([high, -low])[:, None]
-        for index in np.flatnonzero(np.logical_and.reduce(self._bounds <= box)).tolist():
-            if fcl.collide(self._parts[index], part, YES_OR_NO, result):
-                self._last = [self._parts[index]]
+    def meet(self, boxes: Array, rows: Any = slice(None)) -> Mask:
+        """(..., P) whether boxes (..., 6), their high corners and the negative low ones (m), meet those of ``rows``."""
+        first, *others = zip(self._bounds[:, rows], np.moveaxis(boxes, -1, 0)[..., None], strict=True)
+        met = np.less_equal(*first)
+        for pair in others:
+            met &= np.less_equal(*pair)
+        return met
+
+    def meets(self, part: fcl.CollisionObject, rows: Iterable[int]) -> bool:
+        """Whether a placed part touches or overlaps one of the ``rows`` of these."""
+        for row in rows:
+            if fcl.collide(self._parts[row], part, YES_OR_NO, self._result):
+                self._result, self.last = fcl.CollisionResult(), row
                 return True
         return False
-
-    def meets_last(self, part: fcl.CollisionObject) -> bool:
-        """Whether a placed part touches or overlaps the one that was met last; in a heap it often does."""
-        return bool(self._last and fcl.collide(self._last[0], part))
 
 
 class Broadphase:

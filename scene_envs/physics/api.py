@@ -92,9 +92,9 @@ def stack(
     """(B, N) tensor of a named result (or (B, *shape)), zeros where a row is invalid."""
     shape = (batch.tensor.shape[1],) if shape is None else shape
     out = torch.zeros(len(rows), *shape, dtype=dtype)
-    for index, row in enumerate(rows):
-        if row is not None and row["valid"]:
-            out[index] = torch.as_tensor(np.asarray(row[name]), dtype=dtype)
+    good = {index: row[name] for index, row in enumerate(rows) if row is not None and row["valid"]}
+    if good:
+        out[list(good)] = torch.from_numpy(np.array(list(good.values()))).to(dtype)
     return out
 
 

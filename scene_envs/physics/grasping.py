@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain, product
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +26,8 @@ TURNS = tuple(np.arange(4) * np.pi / 4)
 """Angles (rad) of the closing direction about the approach, counted from an axis of the object."""
 _LOOSE = 1e-5
 """Boxes of the gripper's parts are larger by this (m) on each side, more than what FCL takes for contact."""
+_PARTS = 1 << 9
+"""Boxes of parts that are compared with those of four turned grippers at a time."""
 PLACES = (0.5, 0.0, 1.0)
 """Grasp positions as fractions of the object's extent in the closing direction: its middle, then its two edges."""
 
@@ -120,11 +123,12 @@ class _Hand:
         )
         none = np.empty((0, 3))
         scene = Boxed(list(chain(*placed)), np.concatenate([none, *low]), np.concatenate([none, *high]))
-        own = [Boxed(placed[row], low[row], high[row]) for row in free]
+        ends = np.cumsum([0, *map(len, placed)])
         reached = np.zeros((len(back), len(category)), dtype=bool)
         for side, direction in enumerate(back / np.linalg.norm(back, axis=1, keepdims=True)):
             frames = _frames(rotation[free], direction)
-            trials = zip(frames, self._tips([corners[row] for row in free], frames), own, strict=True)
+            tips = self._tips([corners[row] for row in free], frames)
+            trials = zip(frames, tips, ends[free], ends[free + 1], strict=True)
             reached[side, free] = [self._reaches(*trial, scene) for trial in trials]
         return reached
 
@@ -132,8 +136,9 @@ class _Hand:
         """(n, P, T, 3) m: places of the tips at n objects, from the corners (V, 3) m of each in the world and the
         frames (n, T, 3, 3) of the gripper.
         """
-        along = [points @ turned for points, turned in zip(corners, frames, strict=True)]  # (T, V, 3) each
-        bounds = np.array([(points.min(axis=1), points.max(axis=1)) for points in along]).reshape(-1, 2, len(TURNS), 3)
+        pairs = zip(corners, frames, strict=True)
+        along = [np.ascontiguousarray((points @ turned).swapaxes(1, 2)) for points, turned in pairs]  # (T, 3, V) each
+        bounds = np.array([(points.min(axis=2), points.max(axis=2)) for points in along]).reshape(-1, 2, len(TURNS), 3)
         low, high = bounds[:, 0, None], bounds[:, 1, None]  # (n, 1, T, 3)
         part, reach = np.array(list(product(PLACES, self.gripper.reaches))).T[..., None]  # (P, 1) each
         across = low[..., 0] + part * (high[..., 0] - low[..., 0])  # (n, P, T)
@@ -141,22 +146,38 @@ class _Hand:
         middle = np.broadcast_to(0.5 * (low[..., 1] + high[..., 1]), deep.shape)
         return np.einsum("ntij,nptj->npti", frames, np.stack([across, middle, deep], axis=-1))
 
-    def _reaches(self, frames: Array, tips: Array, own: Boxed, scene: Boxed) -> bool:
-        """Whether at one of the places ``tips`` (P, T, 3) m, turned as ``frames`` (T, 3, 3), one of the object's
-        ``own`` parts is between the fingers, and the gripper meets nothing of the scene.
+    def _reaches(self, frames: Array, tips: Array, start: int, end: int, scene: Boxed) -> bool:
+        """Whether at one of the places ``tips`` (P, T, 3) m, turned as ``frames`` (T, 3, 3), a part of the object, from
+        ``start`` to ``end``, is between the fingers, and the gripper meets nothing of the scene.
         """
         middle = tips[:, :, None] + self.middle @ frames.swapaxes(1, 2)  # (P, T, 4, 3)
         half = self.half @ np.abs(frames).swapaxes(1, 2) + _LOOSE
-        for places, lows, highs in zip(tips, middle - half, middle + half, strict=True):
-            for rotation, place, low, high in zip(frames, places, lows, highs, strict=True):
-                pose = Transform(rotation, place)
-                for part in self.parts:
-                    part.setTransform(pose)
-                if any(map(scene.meets_last, self.parts[1:])):
-                    continue
-                grasp, *body = zip(self.parts, low, high, strict=True)
-                if own.meets(*grasp) and not any(scene.meets(*part) for part in body):
-                    return True
+        boxes = np.concatenate([middle + half, half - middle], axis=-1)
+        struck, (grasp, *body) = [scene.last], self.parts  # in a heap, what was met last is met again
+        likely = scene.meet(boxes[:, :, 1:], struck)[..., 0].tolist()
+        some: Any = None  # whether any part of the scene is near each part of the gripper
+        begin, near, rows = 0, np.empty((0, 0, 0, 0), dtype=bool), None
+        for p, t in np.ndindex(*tips.shape[:2]):
+            pose = Transform(frames[t], tips[p, t])
+            for part in self.parts:
+                part.setTransform(pose)
+            if any(scene.meets(part, struck) for part, is_near in zip(body, likely[p][t], strict=True) if is_near):
+                continue
+            if rows is None:
+                rows = np.flatnonzero(scene.meet(boxes.max(axis=(0, 1, 2))))
+            if p >= begin + len(near):
+                begin, near = p, scene.meet(boxes[p : p + max(1, _PARTS // max(1, len(rows)))], rows)
+                near[:, :, 0, (rows < start) | (rows >= end)] = False
+                some = near.any(axis=-1).tolist()
+            between, *others = near[p - begin, t]
+            is_between, *are_near = some[p - begin][t]
+            trial = zip(body, others, are_near, strict=True)
+            if not is_between or any(scene.meets(part, rows[few].tolist()) for part, few, is_near in trial if is_near):
+                continue
+            last = scene.last
+            if scene.meets(grasp, rows[between].tolist()):
+                scene.last = last  # not a part of this object
+                return True
         return False
 
 

@@ -329,6 +329,14 @@ class Overlaps:
             met = boxes_meet(low, high, low, high, one, other)
             found.append((one[met], other[met]))
         both = np.stack([np.concatenate(column) for column in zip(*found, strict=True)], axis=1)
+        used, ends = np.zeros(len(part), dtype=bool), np.stack([low[:, 2], high[:, 2]])
+        used[both] = True
+        for size, corners in self._corners.items():  # boxes of parts that stand on others reach too far up and down
+            some = np.flatnonzero(used & (self._size[part] == size))
+            height = (corners[self._row[part[some]]] @ turn[some, 2, :, None])[..., 0]  # (P, V) m
+            ends[:, some] = translation[owner[some], 2] + np.stack([height.min(axis=1), height.max(axis=1)])
+        (bottom, top), (one, other) = ends, both.T
+        both = both[np.minimum(top[one] - bottom[other], top[other] - bottom[one]) > _ROUNDING]
         body, part = owner[both], part[both]  # (Q, 2)
         aside = translation + _aside(kind, translation, scene)
         row, depth, normal = self._contacts(part, rotation[body], aside[body])
@@ -404,14 +412,14 @@ def _aside(kind: Index, position: Array, scene: Index) -> Array:
     and on its number among bodies that coincide in its ``scene`` (n,).
     """
     steps = np.array([0.6180339887, 0.7548776662, 0.8191725134])
-    order = np.lexsort((*position.T, kind))
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    rank = np.zeros(len(order), dtype=np.int64)  # larger than that of all coinciding bodies before it
-    near = cKDTree(np.c_[position, scene]).query_pairs(_SAME, p=np.inf, output_type="ndarray")
-    for one, other in sorted(np.sort(place[near], axis=1).tolist()):
-        rank[other] = max(rank[other], rank[one] + 1)
-    return _SAME * np.modf((1.0 + kind + 0.37 * rank[place])[:, None] * steps + np.abs(1e3 * position))[0]  # type: ignore[no-any-return]
+    rank = np.zeros(len(kind), dtype=np.int64)  # of each body, larger than that of all coinciding ones before it
+    if (np.diff(np.sort(position @ steps + 1e3 * scene)) < 4 * _SAME).any():  # or none coincide
+        order = np.lexsort((*position.T, kind))
+        place = np.argsort(order)
+        near = cKDTree(np.c_[position, scene]).query_pairs(_SAME, p=np.inf, output_type="ndarray")
+        for one, other in order[np.array(sorted(np.sort(place[near], axis=1).tolist()), dtype=np.int64).reshape(-1, 2)]:
+            rank[other] = max(rank[other], rank[one] + 1)
+    return _SAME * np.modf((1.0 + kind + 0.37 * rank)[:, None] * steps + np.abs(1e3 * position))[0]  # type: ignore[no-any-return]
 
 
 class MujocoEngine(Engine):
