@@ -34,7 +34,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from agents.cli.main import main as scene_envs
 from agents.cli.main import main_of
@@ -42,6 +42,7 @@ from agents.cli.run_folder import Run
 from agents.configuration.composition import composed
 from agents.diffusion import GaussianProcess, Preconditioning
 from agents.diffusion.gaussian import Moments, NoiseSchedule, timestep_weights
+from agents.networks.denoisers import MixedDenoiser
 from agents.pretraining.initial_prior import prepare
 from agents.pretraining.settings import PretrainConfig
 from agents.pretraining.trainer import Pretrainer
@@ -150,7 +151,7 @@ class FlowPrior(MixedPrior):
         rest = {name: value for name, value in fields.items() if name != "shift"}
         return FlowPriorConfig(**vars(MixedPrior.config_from_state(rest)), shift=float(fields["shift"]))
 
-    def _denoiser(self) -> nn.Module:
+    def _denoiser(self) -> MixedDenoiser:
         config = self.config
         schedule = flow_schedule(config.num_timesteps, config.noise_floor, config.noise_ceiling, config.shift)
         self.process = FlowProcess(schedule, self.preconditioning)
