@@ -138,10 +138,14 @@ class FlowPrior(MixedPrior):
 
     @classmethod
     def like(cls, prior: ScenePrior, shift: float = 1.0) -> FlowPrior:
-        """A flow prior with the network, weights, normaliser and settings of a mixed prior, which is to be trained."""
+        """A flow prior with the network, weights, normaliser and settings of a mixed prior, which is to be trained.
+
+        Of a flow prior, it is the same prior with other levels; its measured error, which is by level, is left out.
+        """
         if not isinstance(prior, MixedPrior):
             raise InvalidInputError(f"a flow prior is made from a mixed prior, not {prior.process_name!r}")
-        flow = cls(FlowPriorConfig(**vars(prior.config), shift=shift), prior.normalizer, prior.preconditioning)
+        config = FlowPriorConfig(**{**vars(prior.config), "shift": shift})
+        flow = cls(config, prior.normalizer, prior.preconditioning)
         flow.load_weights(prior.weights())
         return flow
 

@@ -172,6 +172,11 @@ class TestPrior:
         torch.testing.assert_close(straight.mean[:, order], permuted.mean, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(straight.probs[:, order], permuted.probs, rtol=1e-4, atol=1e-5)
 
+    def test_other_levels_leave_the_weights(self, flow: ModuleType, prior: ScenePrior) -> None:
+        other = flow.FlowPrior.like(prior, shift=0.2)
+        assert float(other.process.schedule.noise_to_signal[500]) == pytest.approx(0.2, rel=0.1)
+        assert all(torch.equal(value, prior.weights()[name]) for name, value in other.weights().items())
+
     def test_a_continuous_prior_is_refused(self, flow: ModuleType) -> None:
         with pytest.raises(InvalidInputError, match="made from a mixed prior, not 'continuous'"):
             flow.FlowPrior.like(tiny_prior("dimsum_table"))
