@@ -171,7 +171,7 @@ def _check_constants(prior: ScenePrior, free: Tensor, name: str) -> None:
     """Raise InvalidInputError if a feature varies in the scenes that the prior would overwrite with a constant."""
     normalizer = prior.normalizer
     constant = normalizer.is_constant.cpu().clone()
-    if prior.process_name == "mixed":
+    if isinstance(prior, MixedPrior):
         constant[POSE_FEATURES:] = False  # its categories are discrete states
     objects = free[free[..., -1] == 0]
     off = ((objects - normalizer.input_min.cpu()).abs() > 1e-4).any(dim=0) & constant
