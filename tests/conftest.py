@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import subprocess
 import sys
 from collections.abc import Iterator
 from functools import partialmethod
@@ -95,12 +96,9 @@ def coarse_browser(browser: Any) -> Any:
 
 
 @pytest.fixture
-def copied_workers() -> Iterator[None]:
-    """Workers of physics and of rewards of files start as copies of this process, and import nothing again."""
-    from tests.helpers.forked import forked_workers
-
-    with forked_workers():
-        yield
+def new_interpreters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers start as users have them: new interpreters, which know nothing of this process."""
+    monkeypatch.setattr("scene_envs.workers.subprocess", subprocess)
 
 
 @pytest.fixture

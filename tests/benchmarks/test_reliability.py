@@ -28,7 +28,6 @@ def test_damaged_files_are_named_or_read_as_they_were():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 @pytest.mark.parametrize(
     ("check", "count"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -51,7 +52,9 @@ def _ranges_of_a_tenth() -> Iterator[None]:
 def folder(tea_house: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of six scenes, made by a spawned process that finds the package by itself."""
     output = tmp_path_factory.mktemp("data") / NAME
-    report = generate(NAME, 6, output, seed=3, workers=1, shard_size=3, progress=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scene_envs.workers.subprocess", subprocess)
+        report = generate(NAME, 6, output, seed=3, workers=1, shard_size=3, progress=False)
     assert report.scenes == 6
     return output
 
@@ -111,7 +114,6 @@ def test_prompts_are_true_of_the_scenes(folder: Path) -> None:
         assert parse_prompt(prompt, NAME).holds(facts), prompt
 
 
-@pytest.mark.usefixtures("copied_workers")
 def test_physics_in_a_pool_is_physics_here(batch: SceneBatch) -> None:
     here = feasibility(batch[:4])
     with PhysicsPool(workers=1) as pool:

@@ -131,7 +131,6 @@ def batch() -> SceneBatch:
 
 
 @engines
-@pytest.mark.usefixtures("copied_workers")
 def test_same_bits_in_any_order_company_and_process(engine: str, batch: SceneBatch) -> None:
     first, settled = feasibility(batch, physics=engine), settle(batch[:2], duration=0.25, physics=engine)
     assert bool((first.displacement > 1e-4).any())

@@ -29,7 +29,6 @@ from scene_envs.physics import (
     settle,
 )
 from scene_envs.scene import SceneBatch
-from tests.helpers.forked import forked_workers
 from tests.helpers.simple_scenes import scene
 
 FIELDS = ("feasible", "depth", "displacement", "rotation", "valid", "counts")
@@ -61,14 +60,13 @@ def pool() -> Iterator[PhysicsPool]:
 def test_none_one_and_two_workers_agree_bit_for_bit(
     batch: SceneBatch, expected: FeasibilityResult, pool: PhysicsPool
 ) -> None:
-    with forked_workers(), PhysicsPool(workers=1) as one:
+    with PhysicsPool(workers=1) as one:
         assert same(feasibility(batch, pool=one), expected)
         assert same(feasibility(batch, pool=pool), expected)
     assert len(pool.process_ids) == 2
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_every_function_runs_in_workers(batch: SceneBatch, pool: PhysicsPool) -> None:
     few = batch[:3]
     assert torch.equal(settle(few, duration=0.25, pool=pool).batch.tensor, settle(few, duration=0.25).batch.tensor)
@@ -77,7 +75,6 @@ def test_every_function_runs_in_workers(batch: SceneBatch, pool: PhysicsPool) ->
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_a_scene_type_that_only_this_process_knows_works_in_workers(pool: PhysicsPool) -> None:
     """Its assets come from no recipe: geometry travels with it."""
     batch = SceneBatch.concatenate([scene(("cube", 0.1 * i, 0.0, 0.0)) for i in range(3)])
@@ -85,7 +82,6 @@ def test_a_scene_type_that_only_this_process_knows_works_in_workers(pool: Physic
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_a_worker_killed_mid_run_costs_nothing(
     batch: SceneBatch, expected: FeasibilityResult, pool: PhysicsPool
 ) -> None:
@@ -103,7 +99,6 @@ def test_a_worker_killed_mid_run_costs_nothing(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_workers_killed_between_two_calls_cost_nothing(
     batch: SceneBatch, expected: FeasibilityResult, pool: PhysicsPool
 ) -> None:
@@ -118,7 +113,6 @@ def test_workers_killed_between_two_calls_cost_nothing(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_a_scene_that_fails_twice_is_invalid_and_the_others_are_not(
     batch: SceneBatch, expected: FeasibilityResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:

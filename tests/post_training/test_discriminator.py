@@ -112,7 +112,6 @@ def test_learning_needs_real_scenes() -> None:
         Discriminator().learn(SceneBatch.empty("dimsum_table", 1))
 
 
-@pytest.mark.usefixtures("copied_workers")
 def test_a_composite_with_foreign_parts_is_refused(tmp_path: Path) -> None:
     foreign = tmp_path / "mine.py"
     allow_local_rewards(foreign)
