@@ -41,8 +41,9 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(autouse=True)
 def _usual_logging() -> None:
     """Warnings reach the tests that read them, whatever a library of an earlier test set for all loggers."""
-    logging.root.setLevel(logging.WARNING)
-    logging.disable(logging.NOTSET)
+    if logging.root.level != logging.WARNING or logging.root.manager.disable:  # either call visits all loggers
+        logging.root.setLevel(logging.WARNING)
+        logging.disable(logging.NOTSET)
     for name, logger in logging.root.manager.loggerDict.items():
         if name.startswith(("scene_envs", "rewards", "agents")) and isinstance(logger, logging.Logger):
             logger.disabled, logger.propagate = False, True
