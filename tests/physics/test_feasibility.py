@@ -224,7 +224,7 @@ def test_projection_before_simulation_keeps_objects_closer_to_what_was_asked(nam
     Simulation alone moves objects further (at most 0.3 m counted per object), though none is thrown away. On the
     pantry, whose objects stand free on boards, both move them alike: 8.7 and 8.6 mm, or 8.8 and 8.9 mm elsewhere.
     """
-    clean = get_grammar(name).sample(np.random.default_rng(4), 5)
+    clean = get_grammar(name).sample(np.random.default_rng(4), 3)
     noise = 0.01 * torch.randn(clean.translations.shape, generator=torch.Generator().manual_seed(1))
     given = clean.with_poses(clean.translations + noise * clean.is_free.unsqueeze(-1), clean.rotations)
 

@@ -40,7 +40,7 @@ def same(first: FeasibilityResult, second: FeasibilityResult) -> bool:
 
 @pytest.fixture(scope="module")
 def batch() -> SceneBatch:
-    clean = get_grammar("dimsum_table").sample(np.random.default_rng(11), 20)
+    clean = get_grammar("dimsum_table").sample(np.random.default_rng(11), 8)
     noise = 0.004 * torch.randn(clean.translations.shape, generator=torch.Generator().manual_seed(0))
     return clean.with_poses(clean.translations + noise * clean.is_free.unsqueeze(-1), clean.rotations)
 
@@ -87,13 +87,13 @@ def test_a_worker_killed_mid_run_costs_nothing(
 ) -> None:
     feasibility(batch[:2], pool=pool)  # both workers are up
     victim = pool.process_ids[0]
-    large = SceneBatch.concatenate([batch] * 4)
+    large = SceneBatch.concatenate([batch] * 6)
     killer = threading.Timer(0.15, os.kill, (victim, signal.SIGKILL))
     killer.start()
     result = feasibility(large, pool=pool)
     killer.join()
     assert bool(result.valid.all())
-    assert torch.equal(result.displacement, expected.displacement.repeat(4, 1))
+    assert torch.equal(result.displacement, expected.displacement.repeat(6, 1))
     assert same(feasibility(batch, pool=pool), expected)
     assert victim not in pool.process_ids
 
@@ -176,21 +176,26 @@ def test_a_worker_computes_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.fixture(scope="module")
 def few() -> SceneBatch:
-    clean = get_grammar("dimsum_table").sample(np.random.default_rng(11), 12)
+    clean = get_grammar("dimsum_table").sample(np.random.default_rng(11), 6)
     noise = 0.004 * torch.randn(clean.translations.shape, generator=torch.Generator().manual_seed(0))
     return clean.with_poses(clean.translations + noise * clean.is_free.unsqueeze(-1), clean.rotations)
 
 
 @pytest.fixture(scope="module")
 def ray_pool() -> Iterator[PhysicsPool]:
-    pytest.importorskip("ray")
+    """On a cluster of one CPU, that is of one worker: each takes seconds to start."""
+    ray = pytest.importorskip("ray")
+    options = {"include_dashboard": False, "log_to_driver": False, "logging_level": "ERROR", "configure_logging": False}
+    ray.init(num_cpus=1, **options)
     with make_pool("ray") as ray_pool:
         yield ray_pool
+    assert ray.is_initialized()  # whoever connected disconnects
+    ray.shutdown()
 
 
 @pytest.fixture
 def shared_ray_pool(ray_pool: PhysicsPool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What asks for workers on Ray gets those of ``ray_pool`` and leaves them running: each takes seconds to start."""
+    """What asks for workers on Ray gets those of ``ray_pool`` and leaves them running."""
     monkeypatch.setattr(
         "scene_envs.physics.make_pool",
         lambda workers, **options: ray_pool if workers == "ray" else make_pool(workers, **options),

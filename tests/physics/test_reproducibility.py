@@ -23,7 +23,7 @@ NOISE = (0.004, 0.03)
 """A little and a lot (m)."""
 COMPOSED = ("feasibility", "make_ready")
 """What the other types are asked of a scene each: `make_ready` projects and settles."""
-SLOTS = 16
+SLOTS = 10
 """How many slots of the scenes of other types are filled."""
 NAMES = [scene_type.name for scene_type in BUILT_IN]
 
