@@ -181,6 +181,7 @@ def test_search_takes_the_reward_the_mask_and_the_planner_by_name(prior: str, fo
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_curves")
 def test_an_experiment_with_the_algorithm_and_the_reward_runs_twice_alike(
     prior: str, folder: str, tmp_path: Path
 ) -> None:

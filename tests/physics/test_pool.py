@@ -261,6 +261,7 @@ def feasibility_counts(few: SceneBatch) -> list[float]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("shared_ray_pool")
+@pytest.mark.usefixtures("blank_curves")
 def test_a_run_on_ray_is_the_run_in_this_process(tmp_path: Path) -> None:
     from agents.post_training import PostTrainConfig, post_train
     from agents.priors.testing import tiny_prior

@@ -34,7 +34,7 @@ def test_doctor_finds_nothing_wrong_with_log_ratio_and_writes_nothing(tmp_path: 
     config = small_config(tmp_path / "run")
     report = diagnose(config, prior=tiny_prior())
     assert report.log_ratio == 0.0
-    assert len(report.steps) == 5
+    assert len(report.steps) == 3
     assert report.steps[-1].std == 0.0
     assert report.steps[-1].weight == 0.0
     assert all(row.gradient_norm > 0 for row in report.steps if row.weight > 0)
