@@ -35,7 +35,7 @@ def trained() -> Discriminator:
     grammar = get_grammar("dimsum_table")
     reward = Discriminator(batch_size=24)
     reward.begin(grammar.sample(np.random.default_rng(0), 96), seed=0)
-    reward.learn(disturbed(grammar.sample(np.random.default_rng(1), 96), 1)[0], steps=70)
+    reward.learn(disturbed(grammar.sample(np.random.default_rng(1), 96), 1)[0], steps=80)
     return reward
 
 
