@@ -85,10 +85,10 @@ def _registries_of_test(_registries_of_module: None) -> Iterator[None]:
         yield
 
 
-@pytest.fixture(autouse=True)
-def _copied_workers_of_doctest(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Workers of an example start as copies of this process: a new interpreter imports for seconds."""
-    if not isinstance(request.node, pytest.DoctestItem):
+@pytest.fixture(autouse=True, scope="session")
+def _copied_workers() -> Iterator[None]:
+    """Workers start as copies of this process, but in tests that use ``new_interpreters``: these import for seconds."""
+    if "SCENE_ENVS_TEST_DEVICE" in os.environ:  # no copy of a process that uses a GPU can use it
         yield
         return
     from tests.helpers.forked import forked_workers

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import subprocess
 import sys
 from collections.abc import Iterator
 from functools import partialmethod
@@ -40,8 +41,9 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(autouse=True)
 def _usual_logging() -> None:
     """Warnings reach the tests that read them, whatever a library of an earlier test set for all loggers."""
-    logging.root.setLevel(logging.WARNING)
-    logging.disable(logging.NOTSET)
+    if logging.root.level != logging.WARNING or logging.root.manager.disable:  # either call visits all loggers
+        logging.root.setLevel(logging.WARNING)
+        logging.disable(logging.NOTSET)
     for name, logger in logging.root.manager.loggerDict.items():
         if name.startswith(("scene_envs", "rewards", "agents")) and isinstance(logger, logging.Logger):
             logger.disabled, logger.propagate = False, True
@@ -95,12 +97,9 @@ def coarse_browser(browser: Any) -> Any:
 
 
 @pytest.fixture
-def copied_workers() -> Iterator[None]:
-    """Workers of physics and of rewards of files start as copies of this process, and import nothing again."""
-    from tests.helpers.forked import forked_workers
-
-    with forked_workers():
-        yield
+def new_interpreters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers start as users have them: new interpreters, which know nothing of this process."""
+    monkeypatch.setattr("scene_envs.workers.subprocess", subprocess)
 
 
 @pytest.fixture

@@ -138,6 +138,7 @@ def test_a_small_file_that_never_ends_is_ended_too(tmp_path: Path, monkeypatch: 
     assert "\n" not in text
 
 
+@pytest.mark.usefixtures("new_interpreters")
 def test_a_process_of_an_import_that_crashes_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sphere(tmp_path, "sphere.stl", 5)
     (tmp_path / "sitecustomize.py").write_text("import os\nos._exit(7)\n")
@@ -146,7 +147,6 @@ def test_a_process_of_an_import_that_crashes_is_told(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_a_large_file_is_imported_as_a_small_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sphere(tmp_path, "sphere.stl", 3)
     monkeypatch.setattr(user_library, "READ_HERE", 10_000)

@@ -28,7 +28,6 @@ def test_damaged_files_are_named_or_read_as_they_were():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 @pytest.mark.parametrize(
     ("check", "count"),
     [
@@ -41,7 +40,7 @@ def test_nothing_is_lost_different_or_silent(check: Callable[[int], Figures], co
     assert_clean(check(count), count)
 
 
-FAMILIES = ("generate", "pretrain", "post-train", "search", "search count")
+FAMILIES = ("pretrain", "search count")
 
 
 @pytest.mark.slow

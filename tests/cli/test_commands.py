@@ -20,6 +20,8 @@ from scene_envs.scene_types import get_scene_type
 from tests.helpers.authors_flux import random_state, write_checkpoint
 from tests.helpers.simulators import no_simulator
 
+pytestmark = pytest.mark.usefixtures("blank_curves")
+
 
 @pytest.fixture(scope="module")
 def prior(tmp_path_factory) -> str:

@@ -16,6 +16,8 @@ from agents.priors.testing import tiny_prior
 from agents.utils.interrupts import Terminated, finishing_steps, terminable
 from scene_envs.files import claimed
 
+pytestmark = pytest.mark.usefixtures("blank_curves")
+
 MAIN = import_module("agents.cli.main")
 """The module; ``agents.cli.main`` is its function."""
 

@@ -555,10 +555,20 @@ def test_masks_planners_and_scene_types_come_from_files(
     assert "list the Python file in the environment variable SCENE_ENVS_FILES" in capsys.readouterr().err
     assert main(["search", f"mask={tmp_path}/other.py:lower", "--allow-local"]) == 2
     assert "there is no file" in capsys.readouterr().err
-    code = (
-        "from scene_envs import get_scene_type; print(get_scene_type('pantry_of_file').slots)"  # processes inherit it
-    )
-    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert int(child.stdout) == get_scene_type("pantry_shelf").slots
     for registry, name in ((_MASKS, "upper"), (_PLANNERS, "greedy"), (_SCENE_TYPES, "pantry")):
         registry.pop(f"{name}_of_file")
+
+
+def test_processes_that_a_command_starts_know_the_scene_types_of_its_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SCENE_ENVS_FILES", "")
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from dataclasses import replace\nfrom scene_envs import get_scene_type, register_scene_type\n"
+        "register_scene_type(replace(get_scene_type('pantry_shelf'), name='pantry_of_file'))\n"
+    )
+    assert main(["generate", f"scene={file}:pantry_of_file", "--allow-local", "--cfg", "job"]) == 0
+    code = "from scene_envs import get_scene_type; print(get_scene_type('pantry_of_file').slots)"
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(child.stdout) == get_scene_type("pantry_shelf").slots

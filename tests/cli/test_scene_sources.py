@@ -15,6 +15,8 @@ from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 
+pytestmark = pytest.mark.usefixtures("blank_curves")
+
 OWN_WORDS = {
     "project": ["workers=0", "pictures=0"],
     "view": ["pictures=0"],

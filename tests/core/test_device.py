@@ -33,7 +33,7 @@ from scene_envs.scene import SceneBatch
 from tests.helpers.fake_gpu import GPU, Crossings, fake, fake_gpu, to_gpu
 from tests.helpers.small_runs import small_config
 
-STEPS = 4
+STEPS = 2
 
 
 @pytest.fixture

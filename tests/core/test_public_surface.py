@@ -90,7 +90,6 @@ STEPS = {
     "the package": ("import scene_envs", ("torch", *HEAVY)),
     "a class": ("from scene_envs import SceneBatch, get_scene_type", HEAVY),
     "an environment": ("import scene_envs.envs.denoising", ("rewards", "agents")),
-    "gym.make": ("gymnasium.make('SceneEnvs/Denoising-v0', reward='object_count', num_steps=1).reset(seed=0)", ()),
     "planners": ("from agents.planning import list_planners; found['known'] = list(list_planners())", ()),
     "text encoders": ("import agents.networks.text_encoders", ("transformers",)),
 }

@@ -92,7 +92,6 @@ def test_the_others_of_the_group_are_loaded_and_each_failure_is_told(install, mo
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_rewards_are_listed_beside_one_that_crashes_or_hangs_the_interpreter(install, capsys) -> None:
     bodies = {
         "tidy": GOOD,

@@ -19,7 +19,6 @@ from scene_envs.datasets import generate
 from scene_envs.errors import InvalidInputError, PhysicsError
 from scene_envs.physics import PhysicsPool, feasibility
 from scene_envs.workers import Process, Task, WorkerFailure, WorkerPool, run_apart
-from tests.helpers.forked import forked_workers
 
 TARGET = f"{__name__}:Target"
 
@@ -75,12 +74,11 @@ def tasks(word: str, *arguments: Any, **facts: Any) -> list[Task]:
 
 @pytest.fixture(scope="module")
 def pool() -> Iterator[WorkerPool]:
-    with forked_workers(), WorkerPool(TARGET, (10,), workers=2, timeout=20.0) as pool:
+    with WorkerPool(TARGET, (10,), workers=2, timeout=20.0) as pool:
         yield pool
 
 
 @pytest.mark.parametrize("workers", [0, 1, 3])
-@pytest.mark.usefixtures("copied_workers")
 def test_results_come_in_order_for_any_number_of_workers(workers: int) -> None:
     with WorkerPool(TARGET, (10,), workers=workers) as pool:
         assert pool.map(tasks("scaled", *range(20))) == [10 * number for number in range(20)]
@@ -103,7 +101,6 @@ def test_a_task_that_fails_is_split_and_a_part_that_fails_again_has_a_reason(poo
         assert "test_workers.py" in str(five.__cause__)
 
 
-@pytest.mark.usefixtures("copied_workers")
 def test_a_task_whose_worker_was_killed_is_done_by_another(
     pool: WorkerPool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -112,7 +109,6 @@ def test_a_task_whose_worker_was_killed_is_done_by_another(
     assert f"task {tmp_path / 'died'} crashed its process (SIGKILL); it is tried once more" in caplog.text
 
 
-@pytest.mark.usefixtures("copied_workers")
 def test_tasks_that_end_their_worker_or_take_too_long_twice_fail_and_say_how(pool: WorkerPool) -> None:
     finished: list[Any] = []
     results = pool.map([*tasks("leaves", 3), *tasks("scaled", 1)], done=lambda task, result: finished.append(result))
@@ -135,7 +131,6 @@ def test_what_a_target_refuses_is_raised_and_reports_are_passed_on(pool: WorkerP
     assert reported == [0, 1, 2]
 
 
-@pytest.mark.usefixtures("copied_workers")
 def test_an_interrupt_ends_the_workers_that_work(pool: WorkerPool) -> None:
     def interrupt(_: int) -> None:
         raise KeyboardInterrupt
@@ -148,7 +143,6 @@ def test_an_interrupt_ends_the_workers_that_work(pool: WorkerPool) -> None:
     assert pool.map(tasks("scaled", 1, 2)) == [10, 20]
 
 
-@pytest.mark.usefixtures("copied_workers")
 def test_a_target_that_cannot_be_made_ends_the_call_and_not_the_pool() -> None:
     with WorkerPool(f"{__name__}:broken", (1,), workers=2) as pool:
         with pytest.raises(PhysicsError, match=r"start of 3 workers in a row failed \(OSError: no target\)"):
@@ -159,7 +153,6 @@ def test_a_target_that_cannot_be_made_ends_the_call_and_not_the_pool() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux only")
-@pytest.mark.usefixtures("copied_workers")
 def test_memory_is_limited_beyond_that_of_the_start() -> None:
     worker = Process(TARGET, (1,), memory=2**28)
     worker.answer()
@@ -171,7 +164,6 @@ def test_memory_is_limited_beyond_that_of_the_start() -> None:
     worker.stop()
 
 
-@pytest.mark.usefixtures("copied_workers")
 def test_one_task_apart() -> None:
     assert run_apart("operator:neg", 3, 60.0) == -3
     with pytest.raises(WorkerFailure, match="took longer than") as caught:
@@ -219,6 +211,7 @@ def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("new_interpreters")
 def test_workers_import_nothing_from_the_current_folder(trap: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("def few(batch):\n    return -batch.counts\n")
     allow_local_rewards("mine.py")

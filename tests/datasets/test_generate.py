@@ -160,7 +160,6 @@ def test_killed_and_started_again_the_files_are_the_same(cups: Path, tmp_path: P
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_two_workers_write_the_same_files_and_a_dying_one_is_replaced(
     cups: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -53,7 +53,7 @@ CLAIMS_OF = {"count": (ObjectCount,), "names": (NameCount,), "relations": RELATI
 
 @pytest.fixture(scope="module")
 def batch() -> SceneBatch:
-    return get_grammar("dimsum_table").sample(np.random.default_rng(2), 150)
+    return get_grammar("dimsum_table").sample(np.random.default_rng(2), 60)
 
 
 @pytest.mark.parametrize("kind", ["count", "names", "relations"])
@@ -74,7 +74,7 @@ def test_kinds_are_mixed_and_seeded(batch: SceneBatch) -> None:
     prompts = describe(batch, np.random.default_rng(0))
     assert prompts == describe(batch, np.random.default_rng(0))
     kinds = Counter("count" if "objects" in p else "relations" if "where" in p else "names" for p in prompts)
-    assert min(kinds[kind] for kind in CLAIMS_OF) >= 30
+    assert min(kinds[kind] for kind in CLAIMS_OF) >= 12
 
 
 @pytest.mark.slow
@@ -87,7 +87,7 @@ def test_three_prompts_of_different_kinds_per_scene(batch: SceneBatch) -> None:
 
 
 def test_more_prompts_than_kinds_are_all_different(batch: SceneBatch) -> None:
-    for seven in describe_all(batch[:20], np.random.default_rng(0), count=7):
+    for seven in describe_all(batch[:8], np.random.default_rng(0), count=7):
         assert len(set(seven)) == 7
 
 
@@ -369,12 +369,11 @@ def test_all_prompts_parse_back_and_hold(name: str) -> None:
 @types
 def test_a_second_opinion_agrees(name: str) -> None:
     batch = scenes(name)
-    for seed in range(2):
-        prompts = describe(batch, np.random.default_rng(seed), kinds=["names", "relations"])
-        for index, prompt in enumerate(prompts):
-            oracle = Oracle(batch[index])
-            for claim in parse_prompt(prompt, name).claims:
-                assert oracle.is_true(claim), (index, prompt, claim)
+    prompts = describe(batch, np.random.default_rng(0), kinds=["names", "relations"])
+    for index, prompt in enumerate(prompts):
+        oracle = Oracle(batch[index])
+        for claim in parse_prompt(prompt, name).claims:
+            assert oracle.is_true(claim), (index, prompt, claim)
 
 
 @pytest.mark.slow

@@ -171,7 +171,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_search_takes_the_reward_the_mask_and_the_planner_by_name(prior: str, folder: str, tmp_path: Path) -> None:
     words = ["objective=tower", "objective_scale=0.5", "mask=outer", "planner=levels", "slots=6"]
     small = ["budget=3", "branching=2", "num_steps=1", f"output={tmp_path}", "--config-dir", folder]
@@ -182,7 +181,7 @@ def test_search_takes_the_reward_the_mask_and_the_planner_by_name(prior: str, fo
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
+@pytest.mark.usefixtures("blank_curves")
 def test_an_experiment_with_the_algorithm_and_the_reward_runs_twice_alike(
     prior: str, folder: str, tmp_path: Path
 ) -> None:

@@ -40,6 +40,7 @@ PAGES_WITH_COMMANDS = [page for page in PAGES if page not in HISTORY and inline_
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("new_interpreters")
 @pytest.mark.parametrize("page", PAGES_WITH_CODE)
 def test_a_page_runs_from_top_to_bottom(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -266,7 +266,7 @@ def test_held_out_scenes_may_be_a_folder_of_their_own(scenes: SceneBatch, tmp_pa
 
 @pytest.mark.slow
 def test_a_union_takes_as_many_scenes_of_each_of_its_types_in_turn(scenes: SceneBatch, tmp_path: Path) -> None:
-    shelves = grammar_scenes("pantry_shelf", 12, seed=6)
+    shelves = grammar_scenes("pantry_shelf", 8, seed=6)
     union = union_scene_type(["dimsum_table", "pantry_shelf"])
     folders = f"{save(scenes, tmp_path / 'a')},{save(shelves, tmp_path / 'b')}"
     real = RealScenes.load(union, 6, data=folders)

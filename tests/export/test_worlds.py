@@ -39,7 +39,7 @@ def grammar_scenes(name: str) -> SceneBatch:
     """
     if name == "dimsum_table":
         return all_scenes()
-    batch = get_grammar(name).sample(np.random.default_rng(0), 3)
+    batch = get_grammar(name).sample(np.random.default_rng(0), 2)
     assert all(sorted(one) != sorted(other) for one, other in pairwise(batch.names()))
     moves = torch.randn(batch.translations.shape, generator=torch.Generator().manual_seed(0))
     return batch.with_poses(batch.translations + 1e-4 * moves, batch.rotations)

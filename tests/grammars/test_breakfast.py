@@ -156,7 +156,7 @@ def test_nothing_hangs_over_the_edge() -> None:
 
 @cache
 def arrays_of(name: str) -> NDArray[np.float32]:
-    return get_grammar(name).sample_array(np.random.default_rng(1), 40)
+    return get_grammar(name).sample_array(np.random.default_rng(1), 28)
 
 
 @pytest.fixture(scope="module")

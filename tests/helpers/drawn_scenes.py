@@ -120,6 +120,6 @@ def check_support(scene: list[Thing], scene_type: SceneType, levels: tuple[float
 
 def check_reproducible(name: str) -> None:
     """A seed gives the same scenes again, and another seed gives others."""
-    first, again, other = (get_grammar(name).sample_array(np.random.default_rng(seed), 2) for seed in (4, 4, 5))
+    first, again, other = (get_grammar(name).sample_array(np.random.default_rng(seed), 1) for seed in (4, 4, 5))
     assert (first == again).all()
     assert not (first == other).all()

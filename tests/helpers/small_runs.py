@@ -39,7 +39,7 @@ def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
         output=str(output),
         iterations=4,
         batch_size=6,
-        num_steps=5,
+        num_steps=3,
         algorithm={"gradient_steps": 2},
         regularisation={"weight": 1.0, "batch_size": 6, "bank_size": 24},
         guard={"scenes": 8, "every": 2},

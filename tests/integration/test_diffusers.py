@@ -30,7 +30,7 @@ STEPS = (25, 50, 100, 1000)
 PREDICTIONS = {"epsilon": "epsilon", "v": "v_prediction", "x0": "sample"}
 PROCESSES = ("continuous", "mixed")
 POSE, STD = 12, 0.5
-CHAIN = 100
+CHAIN = 50
 """Steps of a chain at most: of 1000, the last ones, whose every step is one timestep."""
 
 

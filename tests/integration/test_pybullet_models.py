@@ -193,7 +193,6 @@ def test_overlap_is_that_of_the_boxes(scene_type: SceneType) -> None:
     assert pair.depth == pytest.approx(0.003, abs=1e-6)
 
 
-@pytest.mark.usefixtures("copied_workers")
 def test_workers_agree_with_this_process(scene_type: SceneType) -> None:
     batch = laid(scene_type)
     with PhysicsPool(workers=1) as pool:

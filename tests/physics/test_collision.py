@@ -172,7 +172,7 @@ Pairs = tuple[Overlaps, list[Array], PlacedParts, int]
 @pytest.fixture(scope="module")
 def pairs() -> Pairs:
     """Pairs of library parts, polytopes and slivers in every kind of contact: their overlaps, parts, poses, number."""
-    parts, placed, names = sample(1000, seed=5)
+    parts, placed, names = sample(660, seed=5)
     return Overlaps(parts, [[index] for index in range(len(parts))]), parts, placed, len(names)
 
 

@@ -127,11 +127,10 @@ def test_the_cone_of_friction(engine: str, angle: float, slides: bool) -> None:
 @pytest.fixture(scope="module")
 def batch() -> SceneBatch:
     """Scenes of which some objects are simulated."""
-    return noisy("dimsum_table", 4, 3, scale=0.004)
+    return noisy("dimsum_table", 3, 3, scale=0.004)
 
 
 @engines
-@pytest.mark.usefixtures("copied_workers")
 def test_same_bits_in_any_order_company_and_process(engine: str, batch: SceneBatch) -> None:
     first, settled = feasibility(batch, physics=engine), settle(batch[:2], duration=0.25, physics=engine)
     assert bool((first.displacement > 1e-4).any())
@@ -152,7 +151,7 @@ def test_same_bits_in_any_order_company_and_process(engine: str, batch: SceneBat
 @pytest.mark.parametrize("name", ["dimsum_table", "pantry_shelf"])
 def test_engines_agree_on_scenes_of_grammars(name: str) -> None:
     """With half a millimetre of noise, which leaves some objects in each other and others in the air."""
-    scenes = noisy(name, 8, 5, scale=0.0005)
+    scenes = noisy(name, 5, 5, scale=0.0005)
     one, other = (feasibility(scenes, physics=engine) for engine in ("bullet", "mujoco"))
     assert torch.equal(one.depth, other.depth)
     assert torch.equal(one.feasible, other.feasible)
@@ -223,11 +222,11 @@ def test_auto_takes_mujoco_where_pybullet_is_missing(monkeypatch: pytest.MonkeyP
 
 
 def heap(kind: str) -> SceneBatch:
-    """Twelve boxes, bowls and posts at degenerate places."""
-    rows = np.arange(12)
+    """Eight boxes, bowls and posts at degenerate places."""
+    rows = np.arange(8)
     places = {
-        "at one point": np.repeat([[0.0, 0.0, 0.5]], 12, axis=0),
-        "coincident": np.repeat(np.stack([0.3 * rows[:6] - 0.8, 0 * rows[:6], 0 * rows[:6]], axis=1), 2, axis=0),
+        "at one point": np.repeat([[0.0, 0.0, 0.5]], 8, axis=0),
+        "coincident": np.repeat(np.stack([0.3 * rows[:4] - 0.8, 0 * rows[:4], 0 * rows[:4]], axis=1), 2, axis=0),
         "nested": rows[:, None] * [0.0, 0.0, 0.005],
         "far outside": rows[:, None] * [0.2, 0.0, 0.0] + [10.0, -10.0, 10.0],
     }[kind]

@@ -23,7 +23,7 @@ NOISE = (0.004, 0.03)
 """A little and a lot (m)."""
 COMPOSED = ("feasibility", "make_ready")
 """What the other types are asked of a scene each: `make_ready` projects and settles."""
-SLOTS = 16
+SLOTS = 10
 """How many slots of the scenes of other types are filled."""
 NAMES = [scene_type.name for scene_type in BUILT_IN]
 
@@ -34,7 +34,6 @@ def pool() -> Iterator[PhysicsPool]:
         yield pool
 
 
-@pytest.mark.usefixtures("copied_workers")
 @pytest.mark.parametrize("name", NAMES)
 def test_no_history_changes_a_result(name: str, pool: PhysicsPool) -> None:
     """Each function in workers with histories of their own, and here in a random order, by batch or scene by scene."""
@@ -50,6 +49,7 @@ def test_no_history_changes_a_result(name: str, pool: PhysicsPool) -> None:
         assert same(FUNCTIONS[key](batch[rows]), [values[rows] for values in expected[key]]), (key, rows)
 
 
+@pytest.mark.usefixtures("new_interpreters")
 def test_a_fresh_process_gives_the_same() -> None:
     """A worker's new interpreter that has simulated nothing else, and this one, which has."""
     batch = crowded(TYPE, NOISE[:1], seed=9)
@@ -65,7 +65,6 @@ def test_the_order_of_slots_changes_no_verdict() -> None:
     assert torch.equal(feasibility(shuffled).feasible, feasibility(batch).feasible[:, order])
 
 
-@pytest.mark.usefixtures("copied_workers")
 def test_a_spent_budget_ends_at_the_same_step(pool: PhysicsPool) -> None:
     """Coincident objects: the simulation is cut short, after another one, and in workers, at the same poses."""
     clean = get_grammar(TYPE).sample(np.random.default_rng(2), 2)

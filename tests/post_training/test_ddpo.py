@@ -382,8 +382,8 @@ def test_an_empty_slot_has_credit_under_a_sum_alone(tmp_path: Path, averages: bo
 
 def _credit_in_rooms(folder: Path, reward: Any, algorithm: str) -> tuple[SceneBatch, torch.Tensor, torch.Tensor]:
     """Samples of an untrained prior of rooms, and the credit and the advantage of their poses (B, N)."""
-    prior = tiny_prior("restaurant_low_clutter", process="mixed", seed=3)
-    config = small_config(folder, reward=reward, batch_size=12, algorithm={"name": algorithm})
+    prior = tiny_prior("restaurant_low_clutter", process="mixed", seed=3, slots=40)
+    config = small_config(folder, reward=reward, batch_size=8, algorithm={"name": algorithm})
     learner = PostTrainer(config, prior=prior).learner
     try:
         batch = learner.write_advantage(learner.rollout(0))

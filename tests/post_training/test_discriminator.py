@@ -59,11 +59,11 @@ def test_value_is_the_mean_of_its_credit(trained: Discriminator) -> None:
 
 def test_furniture_of_rooms_is_judged_and_does_not_change_the_value() -> None:
     grammar = get_grammar("restaurant_low_clutter")
-    real, samples = (grammar.sample(np.random.default_rng(seed), 12) for seed in (0, 1))
+    real, samples = (grammar.sample(np.random.default_rng(seed), 8) for seed in (0, 1))
     shift = torch.tensor([0.0, 0.0, 0.3]) * samples.is_furniture[..., None]
-    reward = Discriminator(batch_size=16)
+    reward = Discriminator(batch_size=8)
     reward.begin(real, seed=0)
-    reward.learn(samples.with_poses(samples.translations + shift, samples.rotations), steps=60)
+    reward.learn(samples.with_poses(samples.translations + shift, samples.rotations), steps=50)
     output = reward(samples, RewardContext())
     moved = reward(samples.with_poses(samples.translations + shift, samples.rotations), RewardContext())
     furniture = samples.is_furniture
@@ -112,7 +112,6 @@ def test_learning_needs_real_scenes() -> None:
         Discriminator().learn(SceneBatch.empty("dimsum_table", 1))
 
 
-@pytest.mark.usefixtures("copied_workers")
 def test_a_composite_with_foreign_parts_is_refused(tmp_path: Path) -> None:
     foreign = tmp_path / "mine.py"
     allow_local_rewards(foreign)
@@ -130,8 +129,8 @@ def test_the_parts_of_a_composite_that_learn_are_found() -> None:
 
 
 def test_a_resumed_run_equals_one_without_a_break(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learned_rewards, "FIRST_STEPS", 5)
-    judge = {"name": "discriminator", "steps": 3, "batch_size": 12}
+    monkeypatch.setattr(learned_rewards, "FIRST_STEPS", 2)
+    judge = {"name": "discriminator", "steps": 2, "batch_size": 6}
     reward = {"name": "clip", "reward": judge, "high": 0.9}
     prior = tiny_prior(process="mixed")
     whole = post_train(small_config(tmp_path / "whole", reward=reward, guard_every=1, iterations=2), prior=prior)

@@ -93,7 +93,7 @@ def test_targets_are_the_corrections_of_what_the_sampler_denoises(trainer: PostT
 
 def test_no_target_is_further_than_the_clip(trainer: PostTrainer) -> None:
     learner, found = algorithm(trainer), trainer.learner.rollout(0)
-    for step in learner.steps:
+    for step in (learner.steps[0], learner.steps[-1]):
         at = torch.full((len(found),), step)
         learner.settings.clip = 0.5
         near = learner.corrected(found, at)["denoised"]
@@ -106,17 +106,17 @@ def test_no_target_is_further_than_the_clip(trainer: PostTrainer) -> None:
 
 
 def test_the_prior_comes_nearer_to_guided_samples(trainer: PostTrainer) -> None:
-    """Forty updates on the states of one batch lower their loss."""
+    """Eight updates on the states of one batch lower their loss."""
     learner, found = trainer.learner, trainer.learner.rollout(0)
     states = learner.algorithm.corrected(found, torch.full((6,), learner.algorithm.steps[2]))  # type: ignore[attr-defined]
     loss = GuidanceDistillationLoss(learner.prior)
     before = float(loss(states)["loss_objective"].detach())
-    optimizer = torch.optim.AdamW(learner.parameters, lr=3e-4)
-    for _ in range(40):
+    optimizer = torch.optim.AdamW(learner.parameters, lr=2e-5)
+    for _ in range(8):
         optimizer.zero_grad()
         loss(states)["loss_objective"].backward()
         optimizer.step()
-    assert float(loss(states)["loss_objective"].detach()) < 0.85 * before
+    assert float(loss(states)["loss_objective"].detach()) < 0.7 * before
 
 
 def test_a_prior_that_knows_no_position_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

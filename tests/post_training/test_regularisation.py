@@ -165,7 +165,7 @@ def test_a_target_that_cannot_be_held_is_said_in_log_metrics_and_report(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("agents.post_training.regularisation.MAX_FACTOR", 1.1)
-    config = _run(tmp_path, "ddpo_sf", regularisation__hold=1.001, guard__every=1, optimizer__lr=0.05)
+    config = _run(tmp_path, "ddpo_sf", regularisation__hold=1.001, guard__every=1, num_steps=5, optimizer__lr=0.05)
     with caplog.at_level(logging.WARNING):
         metrics = post_train_and_compare(config, scenes=2, num_steps=2, prior=tiny_prior(slots=6))
     assert metrics["hold"]["not_held_from"] is not None

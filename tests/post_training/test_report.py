@@ -27,7 +27,6 @@ from rewards import make_reward
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.errors import TrainingError
 from scene_envs.scene import SceneBatch
-from tests.helpers.forked import forked_workers
 from tests.helpers.simulators import no_simulator
 from tests.helpers.small_runs import count_objects, small_config
 
@@ -36,7 +35,7 @@ def test_doctor_finds_nothing_wrong_with_log_ratio_and_writes_nothing(tmp_path: 
     config = small_config(tmp_path / "run")
     report = diagnose(config, prior=tiny_prior())
     assert report.log_ratio == 0.0
-    assert len(report.steps) == 5
+    assert len(report.steps) == 3
     assert report.steps[-1].std == 0.0
     assert report.steps[-1].weight == 0.0
     assert all(row.gradient_norm > 0 for row in report.steps if row.weight > 0)
@@ -138,10 +137,9 @@ def test_demonstration_end_to_end(tmp_path: Path, capfd: pytest.CaptureFixture[s
     with pytest.raises(TrainingError, match="the run 'feasible' ended with status 2"):
         run_demo(tmp_path / "refused", workers=0, runs={"feasible": wrong})
     assert "feasible: scene-envs: unknown" in capfd.readouterr().err
-    with forked_workers():
-        with pytest.raises(TrainingError, match="the run 'feasible' ended with status 2"):
-            run_demo(folder, workers=0, scenes=2, num_steps=4, runs={**runs, "feasible": wrong})
-        metrics = run_demo(folder, workers=0, scenes=2, num_steps=4, runs=runs)
+    with pytest.raises(TrainingError, match="the run 'feasible' ended with status 2"):
+        run_demo(folder, workers=0, scenes=2, num_steps=4, runs={**runs, "feasible": wrong})
+    metrics = run_demo(folder, workers=0, scenes=2, num_steps=4, runs=runs)
     on_disk = json.loads((folder / "metrics.json").read_text())
     assert on_disk["runs"]["clutter"]["guard"]["ratio"] == metrics["runs"]["clutter"]["guard"]["ratio"]
     priors = {"base": tiny_prior(slots=6), **{name: ScenePrior.load(folder / name) for name in runs}}

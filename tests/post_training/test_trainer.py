@@ -645,7 +645,6 @@ def test_a_reward_that_draws_from_global_generators_gives_the_same_run_for_the_s
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_a_reward_that_ends_its_process_ends_a_run_with_an_error_and_never_with_success(tmp_path, caplog):
     allow_local_rewards(FILE)
     config = small_config(tmp_path, reward=f"{FILE}:quits")
@@ -655,7 +654,6 @@ def test_a_reward_that_ends_its_process_ends_a_run_with_an_error_and_never_with_
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_a_reward_of_a_file_gives_the_run_of_the_same_function(tmp_path):
     allow_local_rewards(FILE)
     runs = [

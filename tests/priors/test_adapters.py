@@ -62,6 +62,7 @@ def test_the_card_of_a_sum_has_no_figures_of_the_base_prior(tmp_path: Path) -> N
     assert merged.card == {"iterations": 7, "post_training": {"base": "base", "sum": [{"factor": 0.5}]}}
 
 
+@pytest.mark.usefixtures("blank_curves")
 def test_the_card_of_a_run_names_its_base_as_it_was_loaded(tmp_path: Path) -> None:
     base = tiny_prior().save(tmp_path / "base")
     assert ScenePrior.load(base).loaded_as == str(base)

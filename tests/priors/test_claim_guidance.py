@@ -28,7 +28,7 @@ def shift_of(scene: SceneBatch, prompt: str, std: Tensor = STD, **settings: floa
     return guidance(0, 50, lambda: scene, std)[0]
 
 
-def followed(scene: SceneBatch, prompt: str, steps: int = 40) -> SceneBatch:
+def followed(scene: SceneBatch, prompt: str, steps: int = 16) -> SceneBatch:
     """The scene after ``steps`` moves, as if the prior expected it unchanged at each of them."""
     guidance = ClaimGuidance([prompt], scene.scene_type, 1.0)
     for step in range(steps):

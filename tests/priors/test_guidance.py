@@ -143,16 +143,16 @@ def followed(batch: SceneBatch, prompts: list[str]) -> float:
 def test_an_untrained_prior_holds_the_numbers_of_its_prompts(scene_type: str, kind: str) -> None:
     prior = tiny_prior(scene_type, process="mixed", text=True, kernel="squared_absorbing")
     rng = np.random.default_rng(0)
-    prompts = describe(get_grammar(scene_type).sample(rng, 4), rng, kinds=[kind])
-    assert followed(prior.sample(4, prompt=prompts, num_steps=10), prompts) < 0.5
-    assert followed(prior.sample(4, prompt=prompts, claim_guidance=1.0, num_steps=50), prompts) == 1.0
+    prompts = describe(get_grammar(scene_type).sample(rng, 3), rng, kinds=[kind])
+    assert followed(prior.sample(3, prompt=prompts, num_steps=4), prompts) < 0.5
+    assert followed(prior.sample(3, prompt=prompts, claim_guidance=1.0, num_steps=20), prompts) == 1.0
 
 
 def test_objects_that_are_kept_count() -> None:
     prior = tiny_prior(process="mixed", text=True, kernel="squared_absorbing")
     scenes = get_grammar("dimsum_table").sample(np.random.default_rng(1), 4)
     wanted = int(scenes.counts.max()) + 3
-    full = prior.complete(scenes, prompt=f"A scene with {wanted} objects.", claim_guidance=1.0, num_steps=40)
+    full = prior.complete(scenes, prompt=f"A scene with {wanted} objects.", claim_guidance=1.0, num_steps=20)
     assert full.counts.tolist() == [wanted] * 4
     assert torch.equal(full.tensor[~scenes.is_empty], scenes.tensor[~scenes.is_empty])
     nothing = prior.complete(scenes, prompt="A scene with two objects.", claim_guidance=1.0, num_steps=10)
@@ -228,7 +228,7 @@ def test_samples_have_more_feasible_objects(name: str) -> None:
     prior = ScenePrior.load(name)
     share = []
     for strength in (0.0, 1.0):
-        batch = prior.sample(12, num_steps=25, seed=2, physics_guidance=strength)
+        batch = prior.sample(6, num_steps=16, seed=2, physics_guidance=strength)
         share.append(float(feasibility(batch).feasible[batch.is_free].double().mean()))
     assert share[1] > share[0] + 0.05, share
     assert share[1] > 0.8, share
@@ -237,7 +237,7 @@ def test_samples_have_more_feasible_objects(name: str) -> None:
 def test_without_guidance_no_bit_changes_and_with_it_welded_objects_stay() -> None:
     prior = ScenePrior.load("living_room_shelf")
     plain, none, guided = (
-        prior.sample(4, num_steps=10, **how) for how in ({}, {"physics_guidance": 0.0}, {"physics_guidance": 1.0})
+        prior.sample(2, num_steps=6, **how) for how in ({}, {"physics_guidance": 0.0}, {"physics_guidance": 1.0})
     )
     assert torch.equal(plain.tensor, none.tensor)
     assert not torch.equal(plain.translations, guided.translations)
@@ -269,11 +269,11 @@ def test_shipped_priors_that_were_trained_to_be_feasible_are_guided() -> None:
 
 def test_completions_keep_what_is_observed_bit_for_bit() -> None:
     prior = ScenePrior.load("living_room_shelf")
-    scenes = prior.sample(3, num_steps=10, seed=5)
-    completed = prior.complete(scenes, fill=4, num_steps=10, physics_guidance=1.0)
+    scenes = prior.sample(2, num_steps=6, seed=5)
+    completed = prior.complete(scenes, fill=4, num_steps=6, physics_guidance=1.0)
     kept = ~scenes.is_empty
     assert torch.equal(completed.tensor[kept], scenes.tensor[kept])
-    moved = prior.rearrange(scenes, num_steps=10, physics_guidance=1.0)
+    moved = prior.rearrange(scenes, num_steps=6, physics_guidance=1.0)
     assert torch.equal(moved.categories, scenes.categories)
     assert torch.equal(moved.tensor[~scenes.is_free], scenes.tensor[~scenes.is_free])
 

@@ -450,12 +450,12 @@ def test_training_further_lists_the_words_that_the_prior_lacks(
 @pytest.mark.slow
 def test_a_short_training_teaches_what_prompts_say() -> None:
     """Of two kinds of scenes, told apart by prompts alone, the right prompt explains one better than the wrong one."""
-    many = get_grammar("dimsum_table").sample(np.random.default_rng(0), 64).tensor[:, :12]
+    many = get_grammar("dimsum_table").sample(np.random.default_rng(0), 32).tensor[:, :12]
     few = many.clone()
     few[:, 3:] = 0.0
     few[:, 3:, -1] = 1.0  # the table and two more
     raw = torch.cat([many, few])
-    prompts = [("A scene with many objects.",)] * 64 + [("A scene with 3 objects.",)] * 64
+    prompts = [("A scene with many objects.",)] * 32 + [("A scene with 3 objects.",)] * 32
     config = PretrainConfig(
         network={"hidden": 32, "depth": 1, "heads": 2},
         text={"encoder": "vocabulary", "vocabulary": {"width": 32, "depth": 1, "latents": 4}},
@@ -465,12 +465,12 @@ def test_a_short_training_teaches_what_prompts_say() -> None:
     x0 = made.encode(SceneBatch(raw, made.scene_type))
     optimizer, generator = torch.optim.Adam(made.parameters(), lr=3e-3), torch.Generator().manual_seed(0)
     for _ in range(30):
-        rows = torch.randint(128, (16,), generator=generator)
+        rows = torch.randint(64, (16,), generator=generator)
         text = made.encode_prompts([prompts[row][0] for row in rows])
         optimizer.zero_grad()
         made.pretraining_loss(x0[rows], generator, text=text).backward()
         optimizer.step()
-    start = torch.full((128,), made.config.num_timesteps)  # everything is masked
+    start = torch.full((64,), made.config.num_timesteps)  # everything is masked
     loss = {}
     for name, told in (("right", prompts), ("wrong", prompts[::-1])):
         text = made.encode_prompts([group[0] for group in told])

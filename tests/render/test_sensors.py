@@ -76,7 +76,7 @@ def test_depth_normals_and_masks_are_those_of_rays_of_trimesh(name):
     mesh.apply_transform(np.linalg.inv(camera.pose))
     inner = away_from_outlines(view["instance"][0]) & (view["instance"][0] >= 0)
     rows, columns = np.nonzero(inner)
-    chosen = np.random.default_rng(0).permutation(len(rows))[:300]
+    chosen = np.random.default_rng(0).permutation(len(rows))[:120]
     rows, columns = rows[chosen], columns[chosen]
     # The textbook: a pixel with its middle at (u, v) looks along ((u - cx) / fx, (v - cy) / fy, 1)
     rays = np.stack([(columns + 0.5 - 71.5) / 190.0, (rows + 0.5 - 66.25) / 230.0, np.ones(len(rows))], axis=1)
@@ -84,7 +84,7 @@ def test_depth_normals_and_masks_are_those_of_rays_of_trimesh(name):
     order = np.lexsort((points[:, 2], ray))
     ray, first = np.unique(ray[order], return_index=True)
     nearest, face = points[order, 2][first], face[order][first]
-    assert len(ray) == len(rows) == 300
+    assert len(ray) == len(rows) == 120
     depth, normals = view["depth"][0][rows, columns], view["normals"][0][rows, columns]
     off = np.abs(depth - nearest) > 1e-3
     np.testing.assert_array_equal(off, False)
@@ -93,7 +93,7 @@ def test_depth_normals_and_masks_are_those_of_rays_of_trimesh(name):
     expected *= -np.sign(np.einsum("pk,pk->p", expected, rays))[:, None]
     expected = expected @ camera.pose[:3, :3].T
     flat = away_from_outlines(view["normals"][0])[rows, columns]  # rays through an edge may meet either triangle
-    assert flat.sum() > 100
+    assert flat.sum() > 40
     np.testing.assert_allclose(normals[flat], expected[flat], atol=1e-4)
     assert (np.abs(normals - expected).max(axis=1) < 1e-4).mean() > 0.97
 

@@ -24,7 +24,6 @@ from rewards import (
 from rewards.process import SeededReward, is_foreign, run_reward
 from scene_envs.errors import InvalidInputError, RewardError, RewardTimeoutError
 from tests.helpers import hostile_rewards as hostile
-from tests.helpers.forked import forked_workers
 
 FILE = Path(hostile.__file__)
 
@@ -152,6 +151,7 @@ def test_limits_are_positive_numbers(limits):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("new_interpreters")
 def test_scores_of_a_worker_are_those_of_this_process_bit_for_bit_and_its_end_prints_no_traceback(cups, capfd):
     allow_local_rewards(FILE)
     with IsolatedReward(f"{FILE}:named", timeout=60, seed=5) as reward:
@@ -170,14 +170,11 @@ def test_scores_of_a_worker_are_those_of_this_process_bit_for_bit_and_its_end_pr
 def worker():
     """One process for all hostile rewards, until one of them ends it."""
     allow_local_rewards(FILE)
-    with forked_workers():
-        reward = IsolatedReward(f"{FILE}:named", timeout=20, memory=0.5)
-    with reward:
+    with IsolatedReward(f"{FILE}:named", timeout=20, memory=0.5) as reward:
         yield reward
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -209,7 +206,6 @@ def test_a_hostile_reward_costs_its_scenes_and_nothing_else(name, message, cups,
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 def test_a_reward_that_forks_answers_once_for_each_batch(cups, worker):
     for batch in (cups, cups.with_slots(9), cups[:1]):
         names = ("forks",) * len(batch)
@@ -218,7 +214,6 @@ def test_a_reward_that_forks_answers_once_for_each_batch(cups, worker):
         )
 
 
-@pytest.mark.usefixtures("copied_workers")
 def test_a_file_that_draws_when_it_is_imported_gives_the_same_in_every_process(cups, tmp_path):
     """Whatever the process drew before it imports the file, which is new to it."""
     file = Path(shutil.copy(FILE, tmp_path / "draws.py"))
@@ -233,7 +228,6 @@ def test_a_file_that_draws_when_it_is_imported_gives_the_same_in_every_process(c
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("copied_workers")
 @pytest.mark.parametrize(
     ("line", "message"),
     [("import sys; sys.exit(0)", "SystemExit"), ("import os; os._exit(0)", "ended its process"),

@@ -144,7 +144,6 @@ def test_a_target_in_an_installed_reward_package_is_allowed(cups):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("plugin")
-@pytest.mark.usefixtures("copied_workers")
 def test_a_broken_installed_package_is_named(capsys):
     with pytest.raises(RewardError, match=r"open-space-rewards.*not_there"):
         resolve_reward("missing_module")
