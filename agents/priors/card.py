@@ -134,14 +134,14 @@ def read_measures(path: str | os.PathLike[str]) -> tuple[dict[str, float], str |
 
 
 def card_page(name: str, prior: ScenePrior, facts: PriorFacts) -> str:
-    """The model card, Markdown, from the template ``card.md``."""
+    """The model card, Markdown, from the template ``card.md.jinja``."""
     from agents.evaluation import figure_table
 
     network, shown = prior.denoiser.network, ("hidden", "depth", "double_blocks", "single_blocks", "heads")
     sizes = [f"{key} {value}" for key, value in vars(network.config).items() if key in shown]
     if modules := getattr(network.config, "modules", ()):
         sizes.append(f"modules {', '.join(module.name for module in modules)}")
-    return page_template("agents.priors", "card.md").render(
+    return page_template("agents.priors", "card.md.jinja").render(
         name=name,
         prior=prior,
         facts=facts,
