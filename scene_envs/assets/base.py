@@ -16,23 +16,8 @@ from scene_envs.errors import InvalidInputError, unknown_name
 if TYPE_CHECKING:
     import trimesh
 
-_FRUIT = (
-    "apple_gala", "apple_golden", "apple_green", "apple_red", "avocado_a", "avocado_b", "avocado_c", "pear_anjou",
-    "pear_bosc", "pear_red",
-)  # fmt: skip
-ASSET_GROUPS: dict[str, frozenset[str]] = {
-    "fruit": frozenset(_FRUIT),
-    "edible": frozenset((*_FRUIT, "bread_slice", "cereal_box")),
-    "drinks": frozenset(("soda_can", "tea_bottle", "water_jug")),
-    "dishes": frozenset(("bowl", "dinner_plate", "fruit_bowl", "plate", "serving_dish", "shared_plate")),
-    "cups": frozenset(("mug", "teacup")),
-    "cutlery": frozenset(("dinner_spoon", "fork", "knife", "teaspoon")),
-    "steamers": frozenset(("steamer_bottom", "steamer_lid")),
-    "games": frozenset(("board_game_l", "board_game_l2", "board_game_s", "board_game_xl", "game_case")),
-    "toys": frozenset(("stacking_ring", "toy_train")),
-    "furniture": frozenset(("breakfast_table", "cafe_table", "chair", "floor", "shelf")),
-}
-"""Names of assets by group."""
+ASSET_GROUPS: dict[str, frozenset[str]] = {}
+"""Names of assets by group; the built-in ones are filled in with their recipes, from ``recipes/tables.json``."""
 RECIPES: dict[str, RecipeEntry] = {}
 """Recipes registered so far, by asset name."""
 
