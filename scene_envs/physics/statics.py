@@ -17,7 +17,6 @@ from scene_envs.physics.parts import (
     GRAVITY,
     AssetGeometry,
     ContactFace,
-    LibraryGeometry,
     Rows,
     apply,
     area,
@@ -88,7 +87,7 @@ class _Polygons:
 
 
 class Statics:
-    """Closed-form test of rest, from precomputed feet and surfaces."""
+    """Closed-form tests of rest and of contacts, from precomputed feet, surfaces and faces."""
 
     def __init__(self, collider: Collider) -> None:
         self._collider, self._library = collider, (library := collider.library)
@@ -101,8 +100,9 @@ class Statics:
         # the top face may be a rim round a hole
         rims = [None if asset.top is None else _surface(asset.fine.vertices) for asset in library.assets]
         self._rim = _Polygons.of(rims)
-        self._top = _Faces.of([asset.top for asset in library.assets])
-        self._bottom = _Faces.of([asset.bottom for asset in library.assets])
+        self.top = _Faces.of([asset.top for asset in library.assets])
+        self.bottom = _Faces.of([asset.bottom for asset in library.assets])
+        self.hollow = np.array([asset.is_hollow for asset in library.assets])
 
     def at_rest(self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, duration: float) -> Rest:
         """Objects of one or more scenes that need no simulation for ``duration`` seconds."""
@@ -173,21 +173,21 @@ class Statics:
         q = np.flatnonzero(inside)
         up = objects.category[upper[q]]
         corners = _into(objects, lower[q], _out_of(objects, upper[q], self._foot.corners[up]))
-        good[q] = (self._bottom.hole[up] == 0) | (self._surface.outside(part[q], corners).max(axis=1) < 0.0)
+        good[q] = (self.bottom.hole[up] == 0) | (self._surface.outside(part[q], corners).max(axis=1) < 0.0)
         # The test of the rim gives the same result for all parts of the two objects.
         _, leading = np.unique(upper, return_index=True)
         q = leading[candidates[leading]]
         up, down = objects.category[upper[q]], objects.category[lower[q]]
         at_rim = np.abs(self._rim.height[down] - self._surface.height[part[q]]) < _MEETS
         offset = np.linalg.norm(
-            _into(objects, lower[q], _out_of(objects, upper[q], self._bottom.center[up][:, None]))[:, 0]
-            - self._top.center[down],
+            _into(objects, lower[q], _out_of(objects, upper[q], self.bottom.center[up][:, None]))[:, 0]
+            - self.top.center[down],
             axis=1,
         )
         at_rim &= self._rim.outside(down, local[q])[:, 0] < -_BALANCE
-        hole = self._bottom.hole[up]
-        at_rim &= offset <= self._bottom.corners[up] - self._top.hole[down]
-        at_rim &= (hole == 0) | (offset <= self._top.corners[down] - hole)
+        hole = self.bottom.hole[up]
+        at_rim &= offset <= self.bottom.corners[up] - self.top.hole[down]
+        at_rim &= (hole == 0) | (offset <= self.top.corners[down] - hole)
         good[q] |= at_rim
         # Or several parts carry it, whose contacts are all round the centre of mass.
         q = np.flatnonzero(candidates & ~np.isin(upper, upper[good]))
@@ -228,6 +228,68 @@ class Statics:
             way = np.outer(moved, (0.0, 0.0, 1.0))
             for met in self._collider.may_meet(objects, pairs, first[keep], second[keep], way, -_TOUCHING):
                 still[met[falling[met]]] = False
+
+    def needs_fine(self, objects: Objects, pairs: ObjectPairs) -> Mask:
+        """(n,) objects that must collide with their fine parts."""
+        different = self.differs(objects, pairs)
+        fine = np.zeros(len(objects), dtype=bool)
+        fine[pairs.first[different]] = True
+        fine[pairs.second[different]] = True
+        return fine & self.hollow[objects.category]
+
+    def differs(self, objects: Objects, pairs: ObjectPairs) -> Mask:
+        """(P,) pairs whose coarse parts do not carry each other as the fine ones do. They do in three kinds of contact:
+        the solid outlines of two facing flat faces meet all the way round; an object lies on a flat surface that is
+        larger than it; or two upright objects are side by side.
+        """
+        a, b = pairs.first, pairs.second
+        relevant = (pairs.gap < _REACH) & (self.hollow[objects.category[a]] | self.hollow[objects.category[b]])
+        same_depth = (pairs.gap >= -_SAME_DEPTH) | (pairs.depth >= -pairs.gap - _SAME_DEPTH)
+        facing = np.abs(pairs.direction[:, 2]) > _UPRIGHT
+        first_above = pairs.direction[:, 2] < 0
+        upper, lower = np.where(first_above, a, b), np.where(first_above, b, a)
+        alike = facing & (
+            self._meets_all_round(objects, upper, lower, pairs.gap)
+            | self._on_plane(objects, upper, lower, pairs.low, pairs.high)
+        )
+        upright = objects.rotation[:, 2, 2] > _UPRIGHT
+        side_by_side = (np.abs(pairs.direction[:, 2]) < 0.1) & upright[a] & upright[b]
+        return relevant & ~(same_depth & (alike | side_by_side))
+
+    def _meets_all_round(self, objects: Objects, upper: Index, lower: Index, gap: Array) -> Mask:
+        up, down = objects.category[upper], objects.category[lower]
+        upright = (objects.rotation[upper, 2, 2] > _UPRIGHT) & (objects.rotation[lower, 2, 2] > _UPRIGHT)
+        center_up = _face_center(objects, upper, self.bottom)
+        center_down = _face_center(objects, lower, self.top)
+        offset = np.hypot(center_up[:, 0] - center_down[:, 0], center_up[:, 1] - center_down[:, 1])
+        hole_up, hole_down = self.bottom.hole[up], self.top.hole[down]
+        with np.errstate(invalid="ignore"):
+            meets = ((hole_down == 0) | (offset <= self.bottom.corners[up] - hole_down)) & (
+                (hole_up == 0) | (offset <= self.top.corners[down] - hole_up)
+            )
+            at_faces = np.abs(center_up[:, 2] - center_down[:, 2] - gap) < 5e-3
+        return upright & meets & at_faces
+
+    def _on_plane(self, objects: Objects, upper: Index, lower: Index, low: Array, high: Array) -> Mask:
+        down = objects.category[lower]
+        center = _face_center(objects, lower, self.top)
+        reach_x = np.maximum(high[upper, 0] - center[:, 0], center[:, 0] - low[upper, 0])
+        reach_y = np.maximum(high[upper, 1] - center[:, 1], center[:, 1] - low[upper, 1])
+        with np.errstate(invalid="ignore"):
+            larger = np.hypot(reach_x, reach_y) <= self.top.inner[down]
+            return larger & (self.top.hole[down] == 0) & (objects.rotation[lower, 2, 2] > _UPRIGHT)  # type: ignore[no-any-return]
+
+    def tallest(self, objects: Objects, pairs: ObjectPairs) -> Index:
+        """(n,) number of objects that carry each object, one above the other (0 on a fixed surface)."""
+        vertical = (np.abs(pairs.direction[:, 2]) > 0.5) & (pairs.gap < _REACH)
+        a, b = pairs.first[vertical], pairs.second[vertical]
+        first_above = pairs.direction[vertical, 2] < 0
+        upper, lower = np.where(first_above, a, b), np.where(first_above, b, a)
+        depth = np.zeros(len(objects), dtype=np.int64)
+        for index in np.argsort(objects.translation[upper, 2], kind="stable"):
+            if not objects.fixed[lower[index]]:
+                depth[upper[index]] = max(depth[upper[index]], depth[lower[index]] + 1)
+        return depth
 
 
 def _rises(support: Index, drop: Array, fixed: Mask) -> tuple[Array, Index]:
@@ -295,77 +357,6 @@ class _Faces:
 
         center = np.array([(np.nan, np.nan) if face is None else face.center for face in faces])
         return cls(column("height"), center, column("inner"), column("corners"), column("hole"))
-
-
-class Support:
-    """Test of contacts, from precomputed faces."""
-
-    def __init__(self, library: LibraryGeometry) -> None:
-        self.hollow = np.array([asset.is_hollow for asset in library.assets])
-        self.bottom = _Faces.of([asset.bottom for asset in library.assets])
-        self.top = _Faces.of([asset.top for asset in library.assets])
-
-    def needs_fine(self, objects: Objects, pairs: ObjectPairs) -> Mask:
-        """(n,) objects that must collide with their fine parts."""
-        different = self.differs(objects, pairs)
-        fine = np.zeros(len(objects), dtype=bool)
-        fine[pairs.first[different]] = True
-        fine[pairs.second[different]] = True
-        return fine & self.hollow[objects.category]
-
-    def differs(self, objects: Objects, pairs: ObjectPairs) -> Mask:
-        """(P,) pairs whose coarse parts do not carry each other as the fine ones do. They do in three kinds of contact:
-        the solid outlines of two facing flat faces meet all the way round; an object lies on a flat surface that is
-        larger than it; or two upright objects are side by side.
-        """
-        a, b = pairs.first, pairs.second
-        relevant = (pairs.gap < _REACH) & (self.hollow[objects.category[a]] | self.hollow[objects.category[b]])
-        same_depth = (pairs.gap >= -_SAME_DEPTH) | (pairs.depth >= -pairs.gap - _SAME_DEPTH)
-        facing = np.abs(pairs.direction[:, 2]) > _UPRIGHT
-        first_above = pairs.direction[:, 2] < 0
-        upper, lower = np.where(first_above, a, b), np.where(first_above, b, a)
-        alike = facing & (
-            self._meets_all_round(objects, upper, lower, pairs.gap)
-            | self._on_plane(objects, upper, lower, pairs.low, pairs.high)
-        )
-        upright = objects.rotation[:, 2, 2] > _UPRIGHT
-        side_by_side = (np.abs(pairs.direction[:, 2]) < 0.1) & upright[a] & upright[b]
-        return relevant & ~(same_depth & (alike | side_by_side))
-
-    def _meets_all_round(self, objects: Objects, upper: Index, lower: Index, gap: Array) -> Mask:
-        up, down = objects.category[upper], objects.category[lower]
-        upright = (objects.rotation[upper, 2, 2] > _UPRIGHT) & (objects.rotation[lower, 2, 2] > _UPRIGHT)
-        center_up = _face_center(objects, upper, self.bottom)
-        center_down = _face_center(objects, lower, self.top)
-        offset = np.hypot(center_up[:, 0] - center_down[:, 0], center_up[:, 1] - center_down[:, 1])
-        hole_up, hole_down = self.bottom.hole[up], self.top.hole[down]
-        with np.errstate(invalid="ignore"):
-            meets = ((hole_down == 0) | (offset <= self.bottom.corners[up] - hole_down)) & (
-                (hole_up == 0) | (offset <= self.top.corners[down] - hole_up)
-            )
-            at_faces = np.abs(center_up[:, 2] - center_down[:, 2] - gap) < 5e-3
-        return upright & meets & at_faces
-
-    def _on_plane(self, objects: Objects, upper: Index, lower: Index, low: Array, high: Array) -> Mask:
-        down = objects.category[lower]
-        center = _face_center(objects, lower, self.top)
-        reach_x = np.maximum(high[upper, 0] - center[:, 0], center[:, 0] - low[upper, 0])
-        reach_y = np.maximum(high[upper, 1] - center[:, 1], center[:, 1] - low[upper, 1])
-        with np.errstate(invalid="ignore"):
-            larger = np.hypot(reach_x, reach_y) <= self.top.inner[down]
-            return larger & (self.top.hole[down] == 0) & (objects.rotation[lower, 2, 2] > _UPRIGHT)  # type: ignore[no-any-return]
-
-    def tallest(self, objects: Objects, pairs: ObjectPairs) -> Index:
-        """(n,) number of objects that carry each object, one above the other (0 on a fixed surface)."""
-        vertical = (np.abs(pairs.direction[:, 2]) > 0.5) & (pairs.gap < _REACH)
-        a, b = pairs.first[vertical], pairs.second[vertical]
-        first_above = pairs.direction[vertical, 2] < 0
-        upper, lower = np.where(first_above, a, b), np.where(first_above, b, a)
-        depth = np.zeros(len(objects), dtype=np.int64)
-        for index in np.argsort(objects.translation[upper, 2], kind="stable"):
-            if not objects.fixed[lower[index]]:
-                depth[upper[index]] = max(depth[upper[index]], depth[lower[index]] + 1)
-        return depth
 
 
 def clusters(objects: Objects, low: Array, high: Array) -> Index:
