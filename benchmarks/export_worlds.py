@@ -1,11 +1,13 @@
 """Size and time of exports of the format ``worlds``, and how far their worlds are from each scene's own MJCF.
 
     python benchmarks/export_worlds.py [--count 4096] [--compared 8] [--scene NAME ...] [--picture worlds.png]
+        [--looks looks.png]
 
 Scenes are drawn from the grammar of each type, 256 different ones, which repeat. Printed are bodies and geometries of
 the model, the size of the files, and CPU time of the export; then, of some scenes, in MuJoCo C: worlds with the same
 contacts at the start, and the median and largest difference of a position after 0.1 s. The picture shows 16 worlds of a
-Dimsum Table, from the arrays.
+Dimsum Table, from the arrays; that of ``--looks`` shows 16 with drawn colours, textures, light and camera, as MuJoCo
+draws them (``MUJOCO_GL=egl`` without a display).
 """
 
 from __future__ import annotations
@@ -28,6 +30,16 @@ from scene_envs.render import gallery, render
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import get_scene_type, list_scene_types
 
+LOOKS = {
+    "color": {"uniform": [0.3, 1.0]},
+    "texture": {"choice": ["none", "none", "checker", "gradient", "flat"]},
+    "light_direction": {"normal": [0.0, 0.25]},
+    "light_intensity": {"uniform": [0.5, 2.5]},
+    "light_color": {"uniform": [0.6, 1.0]},
+    "camera_position": {"uniform": [-0.5, 0.5]},
+    "camera_target": {"normal": [0.0, 0.03]},
+    "camera_fov_y": {"uniform": [-8.0, 4.0]},
+}
 EXAMPLE = run_path(str(Path(__file__).parents[1] / "examples" / "worlds.py"))
 
 
@@ -61,6 +73,17 @@ def scenes_of(path: Path) -> SceneBatch:
     return SceneBatch.from_parts(*parts, batch.scene_type)
 
 
+def seen(path: Path, world: int) -> np.ndarray:
+    """(180, 240, 3): what the camera of a world sees, as MuJoCo draws it."""
+    model, state = EXAMPLE["mujoco_world"](path, world)
+    mujoco.mj_forward(model, state)
+    option = mujoco.MjvOption()
+    option.geomgroup[3] = 0  # not the convex parts
+    with mujoco.Renderer(model, 180, 240) as renderer:
+        renderer.update_scene(state, "scene", option)
+        return renderer.render()
+
+
 def main() -> None:
     """Print the table and draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -68,6 +91,7 @@ def main() -> None:
     parser.add_argument("--compared", type=int, default=8)
     parser.add_argument("--scene", nargs="*", default=list_scene_types())
     parser.add_argument("--picture", type=Path)
+    parser.add_argument("--looks", type=Path)
     options = parser.parse_args()
     table = Table(
         "scenes", "bodies", "geometries", "npz, MB", "all files, MB", "CPU s", "same contacts", "after 0.1 s, m"
@@ -96,6 +120,12 @@ def main() -> None:
             shown = scenes_of(Path(folder) / "worlds.npz")
         picture = gallery(list(render(shown, width=240, height=180)), columns=4)
         picture.quantize(128).save(options.picture, optimize=True)
+    if options.looks:
+        with tempfile.TemporaryDirectory() as folder:
+            drawn = get_grammar("dimsum_table").sample(np.random.default_rng(0), 16)
+            export(drawn, folder, "worlds", randomization=LOOKS)
+            images = [seen(Path(folder) / "worlds.npz", world) for world in range(16)]
+        gallery(images, columns=4).quantize(128).save(options.looks, optimize=True)
 
 
 if __name__ == "__main__":

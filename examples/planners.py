@@ -115,7 +115,7 @@ class UCTPlanner(PlannerSettings):
             made = ledger.expand([(node.candidate, action) for node, action in chosen])
             if not made:
                 break
-            for (node, _), child in zip(chosen, made, strict=True):
+            for (node, _), child in zip(chosen, made, strict=False):
                 for above in node.line():
                     above.pending -= 1
                 if child.valid:

@@ -35,14 +35,19 @@ def world_fields(
         fields = {key[6:]: file[key][scenes] for key in file if key.startswith("world/")}
         fields |= {key[5:]: file[key][fields["geom_dataid"]] for key in file if key.startswith("mesh/")}
     fields["body_pos"] += at
+    fields["cam_pos"] += at
     fields["qpos0"].reshape(len(scenes), -1, 7)[..., :3] += at
     names = [model.body(index).name.removeprefix(prefix) for index in range(model.nbody)]
     bodies = [index for index, name in enumerate(names) if name.startswith(("welded_", "object_"))]
     geometry, free = model.body_geomadr[bodies[0]], [index for index in bodies if model.body_jntnum[index]]
-    for name in ("geom_dataid", "geom_matid"):  # the first geometry of worlds.xml has mesh 0 and material 0
-        fields[name] += np.where(fields[name] < 0, 0, getattr(model, name)[geometry]).astype(fields[name].dtype)
+    material = model.geom_matid[geometry]
+    for name, shift in (("geom_dataid", model.geom_dataid[geometry]), ("mat_texid", model.mat_texid[material, 1] - 1)):
+        fields[name] += np.where(fields[name] < 0, 0, shift).astype(
+            fields[name].dtype
+        )  # mesh 0, texture 1 in worlds.xml
     joints = model.body_jntadr[free[:1]]
-    first = {"body": bodies[0], "geom": geometry}
+    first = {"body": bodies[0], "geom": geometry, "mat": material}
+    first |= {"light": model.light(f"{prefix}lamp").id, "cam": model.camera(f"{prefix}scene").id}
     first |= {"dof": model.jnt_dofadr[joints].sum(), "qpos0": model.jnt_qposadr[joints].sum()}
     for name, rows in fields.items():
         kind = name.split("_")[0]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ from rewards.base import (
 )
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import FINITE, Checked, InvalidInputError
 from scene_envs.scene import SceneBatch
 
 
@@ -49,10 +49,12 @@ class WeightedSum:
 
     def __init__(self, rewards: Sequence[Any], weights: Sequence[float] | None = None, offset: float = 0.0) -> None:
         self.rewards = _resolve_parts(self.name, rewards)
-        self.weights = tuple(1.0 for _ in self.rewards) if weights is None else tuple(float(w) for w in weights)
+        self.weights = tuple(1.0 for _ in self.rewards) if weights is None else tuple(weights)
         if len(self.weights) != len(self.rewards):
             raise InvalidInputError(f"weighted_sum: {len(self.rewards)} rewards need as many weights, got {weights!r}")
-        self.offset = float(offset)
+        self.offset = offset
+        for key, value in [*(("weights", weight) for weight in self.weights), ("offset", offset)]:
+            FINITE.check("weighted_sum: ", key, value, False)
         self.facts = facts_of(*self.rewards)
         vars(self).update(self.facts)
 
@@ -107,7 +109,7 @@ class Product:
 
 @register_reward("clip")
 @dataclass(frozen=True)
-class Clip:
+class Clip(Checked):
     """A reward kept between two bounds.
 
     Attributes:
@@ -120,11 +122,13 @@ class Clip:
     """
 
     name: ClassVar[str] = "clip"
+    place = "clip: "
     reward: Any
-    low: float | None = None
-    high: float | None = None
+    low: Annotated[float, FINITE] | None = None
+    high: Annotated[float, FINITE] | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         reward = resolve_reward(self.reward)
         vars(self).update(facts_of(reward), reward=reward)
         if self.low is None and self.high is None:

@@ -45,6 +45,10 @@ class PromptMatch:
     maximum: ClassVar[float] = 1.0
     prompt: str | None = None
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.prompt, str | None):
+            raise InvalidInputError(f"prompt_match: prompt={self.prompt!r} is not a text or null")
+
     @property
     def needs_prompts(self) -> bool:
         """Whether the prompts come with the scenes."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from rewards.base import RewardContext, RewardOutput
 from rewards.registry import register_reward
-from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.errors import Checked, InvalidInputError, Positive, unknown_name
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ SIDES = ("above", "front")
 
 @register_reward("reachability")
 @dataclass(frozen=True)
-class Reachability:
+class Reachability(Checked):
     """Share of the free objects that an open parallel gripper can reach without a collision, from 0 to 1.
 
     The gripper moves in a straight line from above or from the front, until some of the object is between its fingers
@@ -39,11 +39,13 @@ class Reachability:
     name: ClassVar[str] = "reachability"
     maximum: ClassVar[float] = 1.0
     averages_objects: ClassVar[bool] = True
+    place = "reachability: "
     sides: str | Sequence[str] = SIDES
-    opening: float = 0.08
-    finger_length: float = 0.045
+    opening: Positive = 0.08
+    finger_length: Positive = 0.045
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         sides = (self.sides,) if isinstance(self.sides, str) else tuple(self.sides)
         for side in sides:
             if side not in SIDES:

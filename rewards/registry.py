@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from rewards.base import Reward, RewardContext, RewardOutput, facts_of
-from scene_envs.errors import InvalidInputError, RewardError
+from scene_envs.errors import InvalidInputError, RewardError, SceneEnvsError
 from scene_envs.registry import ALLOWED, PluginError, Registry, load_plugin, run_file
 from scene_envs.scene import SceneBatch
 
@@ -245,9 +245,9 @@ def resolve_reward(reward: Any) -> Reward:
         if "_target_" in settings:
             target = settings.pop("_target_")
             return _build(_find_target(target), target, settings)
-        if "name" not in settings:
+        if not isinstance(settings.get("name"), str):
             raise InvalidInputError(
-                f"a reward mapping needs 'name' (or '_target_'), got keys {sorted(settings)}; "
+                f"a reward mapping needs 'name' (or '_target_'), a text, got {settings}; "
                 "for example {'name': 'object_count'}"
             )
         return make_reward(settings.pop("name"), **settings)
@@ -363,11 +363,12 @@ def _build(maker: Callable[..., Any], name: str, settings: dict[str, Any]) -> Re
     if not inspect.isclass(maker):
         return FunctionReward(maker, name, **settings)
     try:
-        inspect.signature(maker).bind(**settings)
-    except TypeError as error:
+        reward = maker(**settings)
+    except SceneEnvsError:
+        raise
+    except (TypeError, ValueError) as error:  # a setting that the class does not have, or of another type
         known = str(inspect.signature(maker)).split(" -> ")[0]
-        raise InvalidInputError(f"reward {name!r}: {error}; its settings are {known}") from error
-    reward = maker(**settings)
+        raise InvalidInputError(f"reward {name!r}, made with {settings}: {error}; its settings are {known}") from error
     if not callable(reward):
         raise RewardError(f"reward {name!r}: {maker.__qualname__} has no __call__(batch, context) method")
     return reward  # type: ignore[no-any-return]

@@ -90,7 +90,7 @@ class Limit:
         with suppress(TypeError, ValueError, OverflowError):  # no number, an array, or a number of thousands of digits
             if (value is None and optional) or (not isinstance(value, bool) and self.holds(value)):
                 return
-        null = " and finite" * (isinstance(value, float) and value == math.inf) + ", or null" * optional
+        null = " and finite" * (value == math.inf and "finite" not in self.rule) + ", or null" * optional
         raise InvalidInputError(f"{place}{name}={shown(value)} {self.rule}{null}")
 
 

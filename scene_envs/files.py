@@ -147,6 +147,19 @@ def without_digest(content: Mapping[str, Any], path: str | os.PathLike[str]) -> 
     return plain
 
 
+def read_json(path: Path) -> dict[str, Any]:
+    """The mapping in a JSON file, without its digest. FileNotFoundError where there is none, and a CorruptFileError for
+    one that is no JSON, no mapping, or does not fit its digest.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise CorruptFileError(f"{str(path)!r} is not valid JSON ({type(error).__name__}: {error!s:.200})") from error
+    if not isinstance(content, dict):
+        raise CorruptFileError(f"{str(path)!r} holds no mapping")
+    return without_digest(content, path)
+
+
 def _digest_of(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

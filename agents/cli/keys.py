@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import inspect
+import re
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,7 +23,8 @@ from agents.configuration.composition import (
     field_options,
     group_options,
     hint_of,
-    merged,
+    layered,
+    named_options,
     parse_config,
     verbatim,
 )
@@ -181,7 +183,7 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
         raise InvalidInputError(f"--config-dir {config_dir}: no such folder")
     tree = read_config(config_file) if config_file else {}
     tree.pop("output", None)  # a run that is started again has a folder of its own
-    choices: dict[str, str] = {}
+    choices: dict[str, str] = named_options(tree, fields, config_dir)
     values: dict[str, Any] = {}
     adapter = ""
     for word in words:
@@ -211,9 +213,10 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
     replaced = {*choices, *(key for key in values if key in fields and fields[key].metadata.get("named"))}
     tree = verbatim({key: value for key, value in tree.items() if key not in replaced})
     made = by_hydra(command, config, choices, config_dir)
+    made |= by_hydra(command, config, named_options(made, fields, config_dir), config_dir)
     for key, value in values.items():
         made = _with(made, key, value, config, tree)
-    settings: Any = build(config, merged(tree, made), command=command)
+    settings: Any = build(config, layered(config, tree, made), command=command)
     if not adapter:
         return settings
     if not settings.prior:
@@ -255,19 +258,27 @@ def _is_text(hint: Any, value: str) -> bool:
     return str in options and not (value.startswith("[") and any(get_origin(option) is list for option in options))
 
 
-def _parsed(command: str, key: str, value: str) -> Any:
-    """The value of a word, read by Hydra."""
+def read_override(word: str) -> Any:
+    """A word as Hydra's parser reads it; None for a text that is none of its values."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.core.override_parser.types import Sweep
     from hydra.errors import HydraException
 
-    text = f"[{value}]" if "," in value and value[:1] not in _OPENING else value  # a,b is a list; to Hydra, a sweep
     try:
-        found: Any = OverridesParser.create().parse_override(f"{key}={text}").value()
-        is_sweep = any(isinstance(item, Sweep) for item in (found if isinstance(found, list) else [found]))
+        return OverridesParser.create().parse_override(word)
     except (HydraException, ValueError):
-        is_sweep = True
-    if is_sweep:
+        return None
+
+
+def _parsed(command: str, key: str, value: str) -> Any:
+    """The value of a word, read by Hydra, but for numbers: its import takes as long as the rest of a listing."""
+    if re.fullmatch(r"-?(0|[1-9]\d{0,17})(\.\d+)?", value):
+        return float(value) if "." in value else int(value)
+    from hydra.core.override_parser.types import Sweep
+
+    text = f"[{value}]" if "," in value and value[:1] not in _OPENING else value  # a,b is a list; to Hydra, a sweep
+    override = read_override(f"{key}={text}")
+    found = None if override is None else override.value()
+    if override is None or any(isinstance(item, Sweep) for item in (found if isinstance(found, list) else [found])):
         raise InvalidInputError(f"{command}: a value cannot be read: {key}={value[:200]}")
     if isinstance(found, int) and abs(found) >= 2**63:
         raise InvalidInputError(f"{key}= has {len(str(abs(found)))} digits; whole numbers end at 2^63")
@@ -280,9 +291,8 @@ def _with(made: Mapping[str, Any], key: str, value: Any, config: type, tree: Map
     if not inner and not dataclasses.is_dataclass(_hint(config, head)):
         return {**made, key: value}
     (field,) = (field for field in dataclasses.fields(config) if field.name == head)
-    if field.metadata.get("named") and not isinstance(made.get(head), Mapping):
-        before = made.get(head, tree.get(head, field.default))
-        made = {**made, head: before if isinstance(before, Mapping) else {"name": before}}
+    if field.metadata.get("named"):
+        made = {head: tree.get(head, field.default), **made}
     for part in reversed([head, *inner]):
         value = {part: value}
-    return merged(made, value)
+    return layered(config, made, value)

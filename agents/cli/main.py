@@ -22,7 +22,7 @@ from types import ModuleType
 from typing import Any
 
 from agents.cli.commands import COMMANDS, load_command
-from agents.cli.keys import compose, format_rows, help_text, keys_of
+from agents.cli.keys import compose, format_rows, help_text, keys_of, read_override
 from agents.cli.run_folder import RESUMING, Run, fresh_directory
 from agents.configuration.composition import (
     config_text,
@@ -198,8 +198,6 @@ def _without_file(word: str, allow_local: bool) -> str:
 
     def run(found: re.Match[str]) -> str:
         path = Path(found["path"]).expanduser().resolve()
-        if not path.is_file():
-            raise InvalidInputError(f"{key}={found[0]}: there is no file {str(path)!r}")
         _ask_for_file(key, path, allow_local)
         try:
             run_file(path)
@@ -213,6 +211,8 @@ def _without_file(word: str, allow_local: bool) -> str:
 
 
 def _ask_for_file(key: str, path: Path, allow_local: bool) -> None:
+    if not path.is_file():
+        raise InvalidInputError(f"{key}=: there is no file {str(path)!r}")
     if path in ALLOWED:
         return
     if not allow_local and sys.stdin is not None and sys.stdin.isatty():
@@ -302,14 +302,8 @@ def expand_sweeps(words: Sequence[str]) -> list[tuple[list[str], str]]:
 
 def _values(word: str) -> list[str]:
     """The word, once for every value that it sweeps over."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    try:
-        parsed = OverridesParser.create().parse_override(word)
-    except HydraException:  # a text that is no Hydra value
-        return [word]
-    if not parsed.is_sweep_override():
+    parsed = read_override(word)
+    if parsed is None or not parsed.is_sweep_override():
         return [word]
     key = word.partition("=")[0]
     return [f"{key}={value}" for value in parsed.sweep_string_iterator()]

@@ -135,7 +135,8 @@ class Run:
                 f"{error}, so whether {str(self.directory)!r} was written with these keys cannot be told; give another "
                 f"output, or remove {path.name} to write into the folder all the same"
             ) from error
-        check_same_keys(self.directory, before, parse_config(config_text(self.settings), ""), _MAY_DIFFER)
+        now = parse_config(config_text(self.settings), "")
+        check_same_keys(self.directory, before, now, _MAY_DIFFER, type(self.settings))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

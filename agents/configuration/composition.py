@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 import inspect
@@ -95,6 +94,7 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
                 raise InvalidInputError(f"{path}{field.name}={typed} is neither a name nor a mapping with a name")
             values[field.name] = _shortest(value)
     try:
+        _check_kinds(schema, values, path)
         made: Any = OmegaConf.to_object(OmegaConf.merge(schema, values))
     except errors.InterpolationResolutionError as error:
         place = f"{command}: {path}{error.full_key}".removeprefix(": ")
@@ -105,7 +105,6 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
         known = [path + key for key in dotted(OmegaConf.to_container(schema))]  # type: ignore[arg-type]
         raise unknown_name(f"{command} key".strip(), f"{path}{error.full_key}", known) from error
     except errors.OmegaConfBaseException as error:
-        _require_groups(schema, values, path)
         place = (error.full_key or "").partition("[")[0]
         parent, _, name = place.rpartition(".")
         hint = hint_of(OmegaConf.get_type(OmegaConf.select(schema, parent) if parent else schema), name)
@@ -114,15 +113,18 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
     return made
 
 
-def _require_groups(schema: Any, values: Mapping[str, Any], path: str) -> None:
-    """Refuse a value in the place of a group of keys."""
+def _check_kinds(schema: Any, values: Mapping[str, Any], path: str) -> None:
+    """Refuse a value in the place of a group of keys, and a number in that of a boolean, which OmegaConf takes."""
     from omegaconf import DictConfig, OmegaConf
 
     for key, value in values.items():
         if isinstance(group := schema[key], DictConfig) and dataclasses.is_dataclass(OmegaConf.get_type(group)):
-            if not isinstance(value, Mapping):
+            if isinstance(value, Mapping):
+                _check_kinds(group, value, f"{path}{key}.")
+            elif not str(value).startswith("${"):
                 raise _no_group(path + key, value, group)
-            _require_groups(group, value, f"{path}{key}.")
+        elif isinstance(group, bool) and isinstance(value, int | float) and not isinstance(value, bool):
+            raise _refusal(bool, value, path + key)
 
 
 def _no_group(path: str, value: Any, keys: Iterable[Any]) -> InvalidInputError:
@@ -183,7 +185,7 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
         for part in reversed(inner):
             value = {part: value}
         before = plain_tree(values.get(head, getattr(config, head)))
-        values[head] = merged(before, value) if inner and isinstance(before, Mapping) else value
+        values[head] = layered(type(config), {head: before}, {head: value})[head] if inner else value
     groups = {name: _group(fields[name], value) for name, value in values.items() if isinstance(value, Mapping)}
     return dataclasses.replace(config, **{**values, **groups})  # type: ignore[type-var]
 
@@ -211,17 +213,18 @@ def dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def check_same_keys(
-    folder: Path, before: Mapping[str, Any], now: Mapping[str, Any], may_differ: Collection[str]
+    folder: Path, before: Mapping[str, Any], now: Mapping[str, Any], may_differ: Collection[str], kind: type
 ) -> None:
     """Refuse to go on in a folder that was written with other values of keys, but for those that ``may_differ``; keys
-    of only one of the two do not count, unless they stand in a group of both.
+    of only one of the two do not count, also in a group of the config ``kind``. Settings of a reward or mask do.
     """
+    groups = [field.name for field in dataclasses.fields(kind) if dataclasses.is_dataclass(field.default_factory)]
     heads = [key for key in now if key in before and key not in may_differ and before[key] != now[key]]
     was, is_now = (dotted({key: values[key] for key in heads}) for values in (before, now))
     told = [
         f"{key} was {was.get(key)!r}, is {is_now.get(key)!r}"
         for key in {**was, **is_now}
-        if was.get(key) != is_now.get(key)
+        if was.get(key) != is_now.get(key) and (key.partition(".")[0] not in groups or (key in was and key in is_now))
     ]
     if told:
         raise InvalidInputError(
@@ -374,6 +377,17 @@ def check_option(folder: str, option: str, known: Sequence[str]) -> None:
         raise unknown_name(folder, option, known)
 
 
+def named_options(
+    values: Mapping[str, Any], fields: Mapping[str, dataclasses.Field[Any]], config_dir: str = ""
+) -> dict[str, str]:
+    """Options of groups among the values of fields, given by a text; refuses one that its group does not have."""
+    texts = [name for name, value in values.items() if isinstance(value, str) and name in fields]
+    chosen = {name: values[name] for name in texts if fields[name].metadata.get("option")}
+    for name, value in chosen.items():
+        check_option(name, value, field_options(fields[name], config_dir))
+    return chosen
+
+
 def composed(kind: Kind) -> Kind:
     """A config dataclass that is made in Python as on the command line.
 
@@ -399,21 +413,15 @@ def composed(kind: Kind) -> Kind:
 
 def _complete(kind: type, given: Mapping[str, Any], fields: Mapping[str, dataclasses.Field[Any]]) -> dict[str, Any]:
     """The values given in Python, over those of the recipe and of the named options."""
-    choices = {
-        name: value
-        for name, value in given.items()
-        if isinstance(value, str) and fields[name].metadata.get("folder") and not fields[name].metadata.get("named")
-    }
-    for name, value in choices.items():
-        check_option(name, value, field_options(fields[name]))
-    options = set(choices)
+    choices = named_options(given, fields)
+    options = [*choices]
     if "recipe" in given and given["recipe"] != fields["recipe"].default and len(given) < len(fields):
         choices["recipe"] = given["recipe"]
         check_option("recipe", given["recipe"], group_options("recipe"))
     tree = by_hydra(kind.__name__, kind, choices)
     for name in given.keys() - options:
         is_part = dataclasses.is_dataclass(fields[name].default_factory) and isinstance(given[name], Mapping)
-        tree[name] = merged(tree.get(name, {}), given[name]) if is_part else given[name]
+        tree = layered(kind, tree, {name: given[name]}) if is_part else {**tree, name: given[name]}
     return {name: _group(fields[name], value) for name, value in tree.items()}
 
 
@@ -424,14 +432,20 @@ def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: s
     """Values of the options chosen, as Hydra composes them; interpolations are not resolved. ``choices`` are options by
     field, ``recipe`` and ``+experiment``. An InvalidInputError if Hydra cannot read a file.
     """
-    if not choices:
-        return {}
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    sets = {key: option for key, option in choices.items() if key in ("recipe", "+experiment")}
+    if sets and len(sets) < len(choices):  # options go over the values of the sets
+        options = {key: option for key, option in choices.items() if key not in sets}
+        return layered(kind, by_hydra(command, kind, sets, config_dir), by_hydra(command, kind, options, config_dir))
+    if not sets and not (config_dir and choices):
+        nodes = {key: _nodes(fields[key]).get(option) for key, option in choices.items()}
+        if None not in nodes.values():  # nothing to compose
+            return nodes
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    compose = _compose if config_dir else _compose_once
     try:
-        return copy.deepcopy(compose(kind, tuple(choices.items()), config_dir))
+        return _compose(kind, choices, config_dir)
     except (HydraException, OmegaConfBaseException) as error:
         if f"In 'recipe/{choices.get('recipe')}'" in str(error):
             raise InvalidInputError(
@@ -440,7 +454,14 @@ def by_hydra(command: str, kind: type, choices: Mapping[str, str], config_dir: s
         raise InvalidInputError(f"{command}: {reason_of(error)}") from error
 
 
-def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str = "") -> dict[str, Any]:
+def _nodes(field: dataclasses.Field[Any], config_dir: str = "") -> dict[str, Any]:
+    """The values of a field's registered options; a file of the same name takes the place of an option."""
+    found, files = field.metadata["registered"](), group_options(field.metadata["folder"], config_dir)
+    values = found if isinstance(found, Mapping) else {option: {"name": option} for option in found}
+    return {option: dict(value) for option, value in values.items() if option not in files}
+
+
+def _compose(kind: type, choices: Mapping[str, str], config_dir: str) -> dict[str, Any]:
     """The composition of a config whose groups are empty but for the options chosen."""
     from hydra import compose, initialize_config_module
     from hydra.core.config_store import ConfigStore
@@ -451,23 +472,34 @@ def _compose(kind: type, choices: tuple[tuple[str, str], ...], config_dir: str =
         if not (folder := field.metadata.get("folder")):
             continue
         paths[field.name] = folder if folder == field.name else f"{folder}@{field.name}"
-        found = field.metadata["registered"]()
-        nodes = found if isinstance(found, Mapping) else {option: {"name": option} for option in found}
         store.repo.pop(folder, None)
-        for option in nodes.keys() - set(group_options(folder, config_dir)):  # a file takes the place of a node
-            store.store(group=folder, name=option, node=dict(nodes[option]))
+        for option, node in _nodes(field, config_dir).items():
+            store.store(group=folder, name=option, node=node)
     recipe = ["recipe" for field in dataclasses.fields(kind) if field.name == "recipe"]
     defaults = ["_self_", *({path: None} for path in [*paths.values(), *recipe])]
     places = [f"file://{Path(config_dir).resolve()}"] if config_dir else []
     store.store(name="primary", node={"defaults": defaults, "hydra": {"searchpath": places}})
-    words = [f"{paths.get(key, key)}={option}" for key, option in choices]
+    words = [f"{paths.get(key, key)}={option}" for key, option in choices.items()]
     with initialize_config_module("configs", version_base="1.3"):
         made = OmegaConf.to_container(compose("primary", overrides=words), resolve=False)
     assert isinstance(made, dict)
     return {str(key): value for key, value in made.items()}
 
 
-_compose_once = functools.lru_cache(maxsize=256)(_compose)
+def layered(kind: type, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of the config ``kind``, those of ``second`` over those of ``first``; a component of another name takes the
+    place of the first one with all its settings.
+    """
+    first = dict(first)
+    for field in dataclasses.fields(kind):
+        now = second.get(field.name)
+        if isinstance(now, Mapping) and (field.metadata.get("kinds") or field.metadata.get("named")):
+            before = first.pop(field.name, {})
+            before = {"name": before} if isinstance(before, str) else before
+            names = [part["name"] for part in (before, now) if isinstance(part, Mapping) and "name" in part]
+            if isinstance(before, Mapping) and names[:1] == names[-1:]:
+                first[field.name] = before
+    return merged(first, second)
 
 
 def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
@@ -502,6 +534,7 @@ class OptimizerSettings(Checked):
         lr: peak learning rate.
     """
 
+    place = "optimizer."
     name: Annotated[str, OneOf(OPTIMIZERS, "optimizer")] = "adamw"
     lr: Positive = 1e-3
 
@@ -516,6 +549,7 @@ class LoggerSettings(Checked):
         checkpoint_every: steps or iterations between resumable checkpoints.
     """
 
+    place = "logger."
     name: Annotated[str, OneOf(LOGGERS, "logger")] = "csv"
     checkpoint_every: Count = 10
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any
 
 from torch import nn
@@ -148,16 +149,10 @@ def config_from_state(state: Mapping[str, Any], process: str) -> NetworkConfig:
     name = state.get("kind", "")
     kind = _entry(name, process).config
     values = {key: value for key, value in state.items() if key != "kind"}
-    strange = sorted(values.keys() - {field.name for field in fields(kind)})
-    missing = sorted(
-        field.name
-        for field in fields(kind)
-        if field.name not in values and field.default is MISSING and field.default_factory is MISSING
-    )
-    if strange or missing:
-        raise InvalidInputError(
-            f"the configuration of a {process} {name} network has unknown fields {strange} and lacks {missing}"
-        )
+    try:
+        inspect.signature(kind).bind(**values)
+    except TypeError as error:
+        raise InvalidInputError(f"the configuration of a {process} {name} network: {error}") from error
     check_types(kind, values)
     return kind(**values)
 

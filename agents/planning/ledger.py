@@ -22,7 +22,12 @@ class SearchStoppedError(SceneEnvsError):
 
     Planners built on a :class:`SearchBudget` return their best state. If another planner does not catch this error, the
     run that started the planner keeps the best state that it saw.
+
+    Attributes:
+        states: children of the first pairs of the round, made before the search had to end.
     """
+
+    states: Sequence[Any] = ()
 
 
 class Searchable(Protocol):
@@ -145,23 +150,22 @@ class SearchBudget:
         return self.problem.legal_actions(candidate.state)
 
     def expand(self, pairs: Sequence[tuple[Candidate, int]]) -> list[Candidate]:
-        """The children of the first :attr:`left` (candidate, action) pairs, made in one batch; empty if stopped."""
+        """The children of the first :attr:`left` (candidate, action) pairs; fewer if the search is stopped."""
         pairs = pairs[: self.left]
         if not pairs:
             return []
         try:
             states = self.problem.expand_batch([(parent.state, action) for parent, action in pairs])
-        except SearchStoppedError:
-            self._stopped = True
-            return []
+        except SearchStoppedError as stop:
+            self._stopped, states = True, stop.states
         children = [
             Candidate(state, state_value(self.problem, state), (*parent.path, action))
-            for (parent, action), state in zip(pairs, states, strict=True)
+            for (parent, action), state in zip(pairs, states, strict=not self._stopped)
         ]
         for child in children:
             self.values.append(child.value)
             self.keep(child)
-        if self.progress is not None:
+        if self.progress is not None and children:
             self.progress(len(self.values), self.best.value if self.best.valid else 0.0)
         return children
 

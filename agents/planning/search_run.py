@@ -184,9 +184,7 @@ class _Run:
         if config.baseline and self.spent and not self.stopped and searched < end:
             # Children are seeded by their path: the first scenes are those of the first search, unless that is steered.
             wide = self.spent if config.masks is None else max(actions, -(-self.spent // len(config.masks)))
-            # A plan ends between two batches, which are small where time is limited.
-            drawn = BestOfPlanner() if config.max_seconds is None else BestOfPlanner(parallel=16)
-            _, ended, (best_of,) = self.plan(drawn, wide, self.spent, range(1), "best of N", end - searched)
+            _, ended, (best_of,) = self.plan(BestOfPlanner(), wide, self.spent, range(1), "best of N", end - searched)
             best_of = None if ended.stopped else best_of  # of fewer scenes than the search, so no baseline of it
         seconds = {"search": searched - started, "best_of": time.perf_counter() - searched}
         self._check_found(session.lanes[0].root, env.problem.scale)

@@ -152,6 +152,9 @@ Pairs = Sequence[tuple[Any, int]]
 Request = tuple[Pairs, Any]
 """Request for expansions: pairs and their steering, None for no steering."""
 Ask = Callable[[Request], Sequence[Any]]
+"""Makes the children of the pairs of a request; of the first ones alone when the session ends."""
+_FIRST_BATCH = 16
+"""Scenes that a session with a time limit makes at once before it knows how long one takes."""
 
 
 class Lane:
@@ -176,13 +179,17 @@ class Lane:
         if len(self.values) + len(pairs) > self.budget:
             raise SearchStoppedError(f"the budget of {self.budget} expansions is spent")
         states = list(self.ask((pairs, steering)))
-        for (parent, _), state in zip(pairs, states, strict=True):
+        for (parent, _), state in zip(pairs, states, strict=False):
             if parent is self.root:
                 self.first.append(state)
             value = state_value(self.problem, state)
             self.values.append(value)
             if value > self.best[0]:
                 self.best = (value, state)
+        if len(states) < len(pairs):
+            stop = SearchStoppedError(f"the session ended after {len(states)} of {len(pairs)} expansions")
+            stop.states = states
+            raise stop
         return states
 
     def __getattr__(self, name: str) -> Any:
@@ -204,7 +211,8 @@ class Session:
 
     Args:
         problem: the environment.
-        max_seconds: seconds after which the plans end, at the earliest after their first round; None for no limit.
+        max_seconds: seconds after which the plans end, at the earliest after the first batch, of 16 scenes at
+            most; None for no limit.
         journal: record of the rounds; None keeps none.
 
     Attributes:
@@ -217,10 +225,11 @@ class Session:
     ) -> None:
         if max_seconds is not None and not max_seconds > 0:
             raise InvalidInputError(f"max_seconds={max_seconds} must be more than 0, or null for no limit")
-        self.problem, self.max_seconds, self.journal = problem, max_seconds, journal
+        self.problem, self.journal = problem, journal
         self.stopped = ""
-        self._begun = time.perf_counter()
-        self._rounds = 0
+        self._end = math.inf if max_seconds is None else time.perf_counter() + max_seconds
+        self._has_begun = False
+        self._pace = 0.0  # scenes per second of the last batch
         self.lanes: list[Lane] = []
 
     def run(
@@ -254,15 +263,12 @@ class Session:
     def _run_together(self, planner: Any, lanes: list[Lane], report: Progress) -> list[PlanResult]:
         """Run the plans in threads, one at a time and in order: each runs until it asks for expansions or ends."""
         messages: queue.Queue[Request | PlanResult | BaseException] = queue.Queue()
-        answers: list[queue.Queue[Sequence[Any] | None]] = [queue.Queue() for _ in lanes]
+        answers: list[queue.Queue[Sequence[Any]]] = [queue.Queue() for _ in lanes]
 
         def asks(index: int) -> Ask:
             def ask(asked: Request) -> Sequence[Any]:
                 messages.put(asked)
-                answer = answers[index].get()
-                if answer is None:
-                    raise SearchStoppedError("the search was stopped")
-                return answer
+                return answers[index].get()
 
             return ask
 
@@ -302,14 +308,11 @@ class Session:
                 for steering, part in itertools.groupby(asked.values(), key=lambda one: one[1]):
                     if failure is None:
                         states += self._expand(([pair for pairs, _ in part for pair in pairs], steering))
-            except SearchStoppedError:
-                pass
             except Exception as error:  # ends all plans, and is raised when they are over
-                failure = error
+                failure, states = error, []
             for index, (pairs, _) in asked.items():
-                enough = failure is None and len(states) >= len(pairs)
-                answers[index].put(states[: len(pairs)] if enough else None)
-                states = states[len(pairs) :] if enough else []
+                answers[index].put(states[: len(pairs)])
+                states = states[len(pairs) :]
                 receive(index)
             report(0, 0.0)
         if failure is not None:
@@ -317,28 +320,33 @@ class Session:
         return [results[index] for index in sorted(results)]
 
     def _expand(self, asked: Request) -> Sequence[Any]:
-        """The children of one joint round: from the journal, or made now and written there."""
+        """The children of one joint round, from the journal or made now and written there; those of the first pairs
+        when the session ends. A time limit bounds a batch to the scenes for which there seems to be time; where a
+        planner steers, the children of one parent stay together, as they depend on each other.
+        """
         pairs, steering = asked
-        if self.stopped:
-            raise SearchStoppedError(f"the search was stopped: {self.stopped}")
-        known = [] if self.journal is None else self.journal.take(pairs)
-        if len(known) == len(pairs):
-            self._rounds += 1
-            return known
-        late = self.max_seconds is not None and time.perf_counter() - self._begun > self.max_seconds
-        if late and self._rounds:
-            self.stopped = "time"
-            raise SearchStoppedError(f"max_seconds={self.max_seconds} are over")
-        try:
-            how = () if steering is None else (steering,)
-            states = self.problem.expand_batch(pairs[len(known) :], *how)
-            if self.journal is not None:
-                self.journal.add(states)
-        except KeyboardInterrupt as interrupt:
-            self.stopped = _reason(interrupt)
-            raise SearchStoppedError("the search was interrupted") from None
-        self._rounds += 1
-        return [*known, *states]
+        how = () if steering is None else (steering,)
+        states = [] if self.journal is None or self.stopped else self.journal.take(pairs)
+        self._has_begun |= bool(states)
+        while len(states) < len(pairs) and not self.stopped:
+            begun = time.perf_counter()
+            left, rest = self._end - begun, pairs[len(states) :]
+            if left < 0 and self._has_begun:
+                self.stopped = "time"
+                break
+            size = len(rest) if math.isinf(left) else max(1, int(left * self._pace)) if self._pace else _FIRST_BATCH
+            while how and {id(parent) for parent, _ in rest[:size]} & {id(parent) for parent, _ in rest[size:]}:
+                size += 1
+            try:
+                made = self.problem.expand_batch(rest[:size], *how)
+                if self.journal is not None:
+                    self.journal.add(made)
+            except KeyboardInterrupt as interrupt:
+                self.stopped = _reason(interrupt)
+                break
+            self._has_begun, self._pace = True, len(made) / (time.perf_counter() - begun)
+            states += made
+        return states
 
 
 def _reason(interrupt: KeyboardInterrupt) -> str:

@@ -24,12 +24,12 @@ from agents.post_training.report import (
     ready_section,
     write_report,
 )
-from agents.post_training.run_files import METRICS_NAME, write_metrics
+from agents.post_training.run_files import METRICS_NAME
 from agents.priors.prior import ScenePrior
 from rewards import reward_label
 from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import TrainingError
-from scene_envs.files import read_sealed
+from scene_envs.files import read_sealed, write_json
 from scene_envs.workers import Task, WorkerPool
 
 RUNS: Mapping[str, Sequence[str]] = {"clutter": ["recipe=demo_clutter"], "feasible": ["recipe=demo_feasible"]}
@@ -92,7 +92,7 @@ def run_demo(
     if left_out := _left_out(measured):
         metrics["left_out"] = left_out
     write_report(directory / "report.html", _page(directory, results, measured))
-    write_metrics(directory, metrics)
+    write_json(directory / METRICS_NAME, metrics)
     return metrics
 
 

@@ -14,13 +14,13 @@ import torch
 from torch import Generator, Tensor
 
 from agents.post_training.rollouts import PROMPTS_NAME, PromptSets, stream_seed
-from agents.post_training.run_files import BASE_SAMPLES_NAME, SCENES_NAME, write_text, writing
+from agents.post_training.run_files import BASE_SAMPLES_NAME, SCENES_NAME
 from agents.post_training.settings import RegularisationSettings
 from agents.priors.prior import ScenePrior, asked_objects
 from agents.utils.process_group import ProcessGroup
 from scene_envs import __version__
 from scene_envs.errors import InvalidInputError, SceneEnvsError
-from scene_envs.files import cache_folder, trim_folder
+from scene_envs.files import cache_folder, trim_folder, write_text
 from scene_envs.progress import Progress
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
@@ -124,7 +124,7 @@ def _kept(path: Path, reuse: bool, draw: Callable[[], SceneBatch]) -> SceneBatch
     processes = ProcessGroup.current()
     if processes.is_first and not (reuse and path.exists()):
         batch = draw()
-        writing(f"the scenes {str(path)!r}", lambda: batch.save(path))
+        batch.save(path)
     processes.wait()
     return SceneBatch.load(path)
 

@@ -17,12 +17,7 @@ from torch import Generator, Tensor
 from agents.evaluation.physics_figures import leaving_out, per_scene_and_fraction
 from agents.post_training.guard import realism
 from agents.post_training.rollouts import PromptDeck, run_prompts, stream_seed
-from agents.post_training.run_files import (
-    CHECKPOINT_NAME,
-    SCENES_NAME,
-    write_metrics,
-    write_text,
-)
+from agents.post_training.run_files import CHECKPOINT_NAME, METRICS_NAME, SCENES_NAME
 from agents.post_training.settings import PostTrainConfig
 from agents.post_training.trainer import PostTrainResult, post_train
 from agents.priors.prior import ScenePrior
@@ -31,7 +26,7 @@ from agents.utils.process_group import ProcessGroup
 from rewards import PromptMatch, RewardContext, RewardOutput, evaluate_reward, learned_parts, reward_label
 from rewards.process import close_reward
 from scene_envs.envs.scoring import resolve_prior
-from scene_envs.files import page_part, page_template
+from scene_envs.files import page_part, page_template, write_json, write_text
 from scene_envs.scene import SceneBatch
 
 if TYPE_CHECKING:
@@ -138,7 +133,7 @@ def post_train_and_compare(
     if left_out := {**before.left_out, **after.left_out}:
         metrics["left_out"] = left_out
     write_report(directory / "report.html", _page(result, before, after, metrics))
-    write_metrics(directory, metrics)
+    write_json(directory / METRICS_NAME, metrics)
     return metrics
 
 
@@ -356,7 +351,7 @@ def _page(result: PostTrainResult, before: Measured, after: Measured, metrics: M
             [Picture(pictures[key], key[:-6].title()) for key in ("before_ready", "after_ready") if key in pictures],
             left_out,
         ),
-        Section("Numbers", table=_with_change(first, last)),
+        Section("Numbers", table=rows_with_change(first, last)),
     ]
     title = f"Steering {before.raw.scene_type.name.replace('_', ' ')} toward {reward}"
     return Page(title, lead, tiles, sections, settings)
@@ -408,7 +403,8 @@ def number_rows(columns: Mapping[str, Mapping[str, float]]) -> list[tuple[str, .
     return [("", *columns), *rows]
 
 
-def _with_change(before: Mapping[str, float], after: Mapping[str, float]) -> list[tuple[str, ...]]:
+def rows_with_change(before: Mapping[str, float], after: Mapping[str, float]) -> list[tuple[str, ...]]:
+    """The rows of a table of figures before and after a training, with the relative change in the last column."""
     head, *rows = number_rows({"before": before, "after": after})
     changes = [_relative(before[name], after[name]) for name in _LABELS if name in before and name in after]
     texts = ["" if change is None else f"{change:+.0%}" for change in changes]

@@ -1,70 +1,19 @@
-"""Files of a run: configuration, log, metrics and curve; and its progress on the terminal."""
+"""Names of the files of a run, its curve, and its progress on the terminal."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from agents.configuration.composition import check_same_keys
-from agents.post_training.settings import RESUMABLE
-from agents.utils.checkpoints import load_checkpoint
-from scene_envs import files
-from scene_envs.errors import TrainingError
 from scene_envs.progress import Progress
 
 CHECKPOINT_NAME = "checkpoint.pt"
-LOG_NAME = "log.csv"
 METRICS_NAME = "metrics.json"
 SCENES_NAME = "real_scenes.safetensors"
 BASE_SAMPLES_NAME = "base_samples.safetensors"
-
-
-def write_text(path: Path, text: str) -> None:
-    """Replace ``path`` atomically; a TrainingError leaves a file that was there before unchanged."""
-    writing(repr(str(path)), lambda: files.write_text(path, text))
-
-
-def writing(what: str, write: Callable[[], object]) -> None:
-    """Run ``write``, and turn its OSError or RuntimeError into a TrainingError that names ``what``."""
-    try:
-        write()
-    except (OSError, RuntimeError) as error:
-        raise TrainingError(f"could not write {what} ({error}); free some space and run the same again") from error
-
-
-def write_metrics(directory: Path, metrics: Mapping[str, Any]) -> None:
-    """Write ``metrics.json``; numbers that JSON lacks become null."""
-    path = directory / METRICS_NAME
-    writing(repr(str(path)), lambda: files.write_json(path, metrics))
-
-
-def write_log(directory: Path, history: Sequence[Mapping[str, float]]) -> None:
-    """Write ``log.csv``: one row per iteration, with the union of the columns of all rows."""
-    columns = list(dict.fromkeys(name for row in history for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(history)
-    write_text(directory / LOG_NAME, text.getvalue())
-
-
-def load_resumable(directory: Path, config: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The checkpoint of an interrupted run of the same configuration, as plain values; None without one. A
-    CorruptFileError if it is truncated, an InvalidInputError if the directory holds a run of another configuration.
-    """
-    path = directory / CHECKPOINT_NAME
-    if not path.exists():
-        return None
-    state = load_checkpoint(path)
-    check_same_keys(directory, state.get("config", {}), config, RESUMABLE)
-    return state
-
 
 REWARD_COLOR, GUARD_COLOR, FAINT = "#0f766e", "#b45309", "#99a3ad"
 

@@ -53,6 +53,7 @@ class AlgorithmSettings(Checked):
         scenes_per_prompt: number of scenes of a batch that share a prompt; advantages are computed within such a group.
     """
 
+    place = "algorithm."
     learning_rate: ClassVar[float] = 5e-5
     """Learning rate unless ``optimizer.lr`` names another."""
     regularisation_weight: ClassVar[float] = 0.5
@@ -94,12 +95,12 @@ class DDPOISSettings(DDPOSFSettings):
 
     Attributes:
         clip_epsilon: half-width of the clip of the probability ratio.
-        updates: optimiser steps per batch.
+        updates: optimiser steps per batch; one step is that of DDPO-SF.
     """
 
     name: str = "ddpo_is"
     clip_epsilon: Annotated[float, Limit(lambda value: 0 < value < 1, "must lie between 0 and 1")] = 1e-4
-    updates: Count = 1
+    updates: Count = 4
 
 
 @dataclass
@@ -312,6 +313,7 @@ class GuardLimits(Checked):
         classifier: the same for the accuracy of a classifier that tells samples from real scenes.
     """
 
+    place = "guard.limits."
     count: Nonnegative | None = None
     stack: Nonnegative | None = None
     category: Nonnegative | None = None
@@ -334,6 +336,7 @@ class GuardSettings(Checked):
         limits: limits of the figures of samples.
     """
 
+    place = "guard."
     every: Count = 5
     scenes: Count = 256
     limit: Unlimited = 1.5

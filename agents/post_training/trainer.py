@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 import time
 from contextlib import closing, nullcontext
@@ -15,7 +17,7 @@ import torch
 from tensordict import TensorDict
 from torch import Generator
 
-from agents.configuration.composition import config_text
+from agents.configuration.composition import check_same_keys, config_text
 from agents.configuration.prior_names import short_name
 from agents.post_training.algorithms.base import no_credit_per_object
 from agents.post_training.guard import Guard, GuardReading, SampleCheck, realism
@@ -23,19 +25,10 @@ from agents.post_training.learner import Learner, NonFiniteGradient
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.real_scenes import SceneBank, kept_base_samples, kept_scenes
 from agents.post_training.rollouts import PromptSets, gathered_scenes, reward_figures, run_prompts, stream_seed
-from agents.post_training.run_files import (
-    CHECKPOINT_NAME,
-    draw_curve,
-    load_resumable,
-    run_progress,
-    write_log,
-    write_metrics,
-    write_text,
-    writing,
-)
-from agents.post_training.settings import PostTrainConfig
+from agents.post_training.run_files import CHECKPOINT_NAME, METRICS_NAME, draw_curve, run_progress
+from agents.post_training.settings import RESUMABLE, PostTrainConfig
 from agents.priors.prior import ScenePrior, check_object_count, no_text
-from agents.utils.checkpoints import check_tensors, save_checkpoint
+from agents.utils.checkpoints import check_tensors, load_checkpoint, save_checkpoint
 from agents.utils.interrupts import finishing_steps
 from agents.utils.loggers import RunLogger
 from agents.utils.process_group import ProcessGroup, launched_processes
@@ -44,7 +37,7 @@ from rewards import reward_label
 from scene_envs.arrays import resolve_device
 from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, TrainingError
-from scene_envs.files import claimed, sealed
+from scene_envs.files import claimed, sealed, write_json, write_text
 from scene_envs.scene import SceneBatch
 
 MAX_INVALID = 3
@@ -92,8 +85,8 @@ def post_train(config: PostTrainConfig, *, prior: ScenePrior | None = None, afte
         after: work of the caller that follows, in iterations; the time left that is shown includes it.
 
     Raises:
-        TrainingError: a gradient or a value of the prior is not finite, no reward was valid for too long, the disk is
-            full, or another process ended. The run can be resumed.
+        TrainingError, StorageError: a gradient or a value of the prior is not finite, no reward was valid for too long,
+            the disk is full, or another process ended. The run can be resumed.
         CorruptFileError: the checkpoint in the run directory is truncated.
         InvalidInputError: a setting is wrong, the directory holds a run of another configuration, or the processes
             do not divide the batch.
@@ -161,7 +154,10 @@ class PostTrainer:
         ``after`` the run, in iterations, counts in the time left that is shown.
         """
         config = self.config
-        state = load_resumable(self.directory, self.plain)
+        path = self.directory / CHECKPOINT_NAME
+        state = load_checkpoint(path) if path.exists() else None
+        if state is not None:
+            check_same_keys(self.directory, state.get("config", {}), self.plain, RESUMABLE, PostTrainConfig)
         self.prepare(reuse_scenes=state is not None)
         if state is not None:
             self._restore(state)
@@ -376,9 +372,8 @@ class PostTrainer:
                 "guard_ratio": self.guard.ratio,
             },
         }
-        path = self.directory / "prior"
         if self.processes.is_first:
-            writing(f"the prior {str(path)!r}", lambda: prior.save(path))
+            prior.save(self.directory / "prior")
 
     def _best(self) -> ScenePrior:
         """The prior that was kept last."""
@@ -391,8 +386,7 @@ class PostTrainer:
         first = reading.beyond and self.guard.over_limit_at == reading.iteration
         if batch is None or not reading.samples or not (reading.kept or first) or not self.processes.is_first:
             return
-        path = self.directory / f"{'guard_within' if reading.kept else 'guard_beyond'}.safetensors"
-        writing(f"the guard's samples {str(path)!r}", lambda: batch[:_PICTURED].save(path))
+        batch[:_PICTURED].save(self.directory / f"{'guard_within' if reading.kept else 'guard_beyond'}.safetensors")
 
     def save(self) -> None:
         """Write the resumable checkpoint, which is the same in all processes."""
@@ -407,8 +401,14 @@ class PostTrainer:
         save_checkpoint(self.directory / CHECKPOINT_NAME, state)
 
     def _write_log(self) -> None:
+        """One row per iteration, with the union of the columns of all rows."""
+        text = io.StringIO()
+        columns = list(dict.fromkeys(name for row in self.history for name in row))
+        writer = csv.DictWriter(text, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.history)
         if self.processes.is_first:
-            write_log(self.directory, self.history)
+            write_text(self.directory / "log.csv", text.getvalue())
 
     def _restore(self, state: dict[str, Any]) -> None:
         for name in _STATE:
@@ -433,7 +433,7 @@ class PostTrainer:
             "hold": self.learner.regularisation.summary(),
         }
         if self.processes.is_first:
-            write_metrics(self.directory, metrics)
+            write_json(self.directory / METRICS_NAME, metrics)
             draw_curve(
                 self.history,
                 self.directory / "curve.png",

@@ -75,6 +75,8 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
         return prior, GrammarStream(grammar, prior), prior.encode(held_out)
     if "," in config.data:
         return _prepare_union(config)
+    if not config.data:
+        raise InvalidInputError("data= names no dataset; scene-envs generate makes one, and data=grammar needs none")
     dataset = SceneDataset.load(config.data)
     name, asked = dataset.scene_type.name, str(getattr(config.scene, "name", config.scene))
     if older is not None:

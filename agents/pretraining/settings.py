@@ -114,6 +114,7 @@ class NetworkSettings(Checked):
         modules: modules that are added to the core of the mixed flux network.
     """
 
+    place = "network."
     name: str = "flux"
     hidden: Count = 128
     depth: Count = 6
@@ -164,6 +165,7 @@ class ProcessSettings(Checked):
         denoised_clip: bound on denoised scenes during sampling, in normalised units; 0 for no bound.
     """
 
+    place = "process."
     name: Annotated[str, OneOf(PROCESSES, "process")] = "mixed"
     prediction: Annotated[str, OneOf(("edm", "epsilon", "x0", "v"))] = "edm"
     schedule: Annotated[str, OneOf(("karras", "linear"), "noise schedule")] = "karras"
@@ -209,6 +211,7 @@ class LossSettings(Checked):
             observed. A prior that is trained with 0 adds too many objects if all empty slots are masked.
     """
 
+    place = "loss."
     noise: TrainingNoiseSettings = nested(TrainingNoiseSettings)
     timesteps: Annotated[str, OneOf(("lognormal", "uniform", "both"), "distribution of timesteps")] = "lognormal"
     weighting: Annotated[str, OneOf(("none", "min_snr"), "loss weighting")] = "none"
@@ -279,6 +282,7 @@ class RateSettings(Checked):
         decay: last share of the steps, in which it decays along a cosine; 1 decays from the warm-up on.
     """
 
+    place = "optimizer.rate."
     warmup: Natural = 100
     final: Share = 0.01
     decay: Share = 0.3

@@ -258,7 +258,7 @@ class Pretrainer:
 
     def _load(self) -> None:
         state = load_checkpoint(self.checkpoint_path)
-        check_same_keys(self.directory, state["config"], asdict(self.config), _MAY_DIFFER)
+        check_same_keys(self.directory, state["config"], asdict(self.config), _MAY_DIFFER, type(self.config))
         facts, known = self._data_facts(), state.get("data")
         if known is not None and not (
             known["scenes"] == facts["scenes"] and torch.allclose(known["mean"], facts["mean"], rtol=1e-3, atol=1e-4)

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 from agents.configuration.composition import dotted
 from agents.configuration.prior_names import CONFIG_NAME
 from agents.priors.files import PriorFacts, read_config, write_config
-from scene_envs.errors import CorruptFileError, InvalidInputError
-from scene_envs.files import claimed, read_sealed, write_text
+from scene_envs.errors import InvalidInputError
+from scene_envs.files import claimed, read_json, read_sealed, write_text
 
 if TYPE_CHECKING:
     from agents.priors.prior import ScenePrior
@@ -121,13 +121,9 @@ def read_measures(path: str | os.PathLike[str]) -> tuple[dict[str, float], str |
     """
     file = Path(path) / "metrics.json" if Path(path).is_dir() else Path(path)
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = read_json(file)
     except FileNotFoundError:
         raise InvalidInputError(f"no evaluation at {str(file)!r}; scene-envs evaluate writes one") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CorruptFileError(f"{str(file)!r} is not valid JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise CorruptFileError(f"{str(file)!r} is not a metrics.json: it holds no mapping")
     figures = {
         name: float(value)
         for name, value in content.items()

@@ -40,7 +40,7 @@ class ContinuousPrior(ScenePrior):
 
     >>> from agents.priors.testing import tiny_prior
     >>> prior = tiny_prior("dimsum_table", process="continuous")
-    >>> mean, std = prior.posterior(prior.initial(2, 34), 0, prior.step_table(4))
+    >>> mean, std, _ = prior.transition(prior.initial(2, 34), 0, prior.step_table(4))
     >>> mean.shape, bool((std[0] == 0).all())  # the table is known
     (torch.Size([2, 34, 20]), True)
     """
@@ -90,7 +90,9 @@ class ContinuousPrior(ScenePrior):
     # -- the reverse chain ----------------------------------------------------------------------
 
     def transition(self, x_t: Tensor, step: int, table: StepTableLike, *, eta: float = 1.0) -> GaussianStep:
-        """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters."""
+        """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters. The std is 0 on known
+        entries; all of it is 0 at the last step, which is deterministic, and if ``eta`` is 0.
+        """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         self.process.check_stride(t, previous)
         x0 = self.denoiser(x_t, t)
@@ -99,13 +101,6 @@ class ContinuousPrior(ScenePrior):
         x0_weight, xt_weight, std = self.stride(t, previous, eta, x_t)
         mean = self.clamp(x0_weight * x0 + xt_weight * x_t)
         return GaussianStep(mean, std * self.frame(x_t).moving, x0.detach())
-
-    def posterior(self, x_t: Tensor, step: int, table: StepTableLike, eta: float = 1.0) -> tuple[Tensor, Tensor]:
-        """Mean (B, N, D) and std (N, D) of x_{t-1} given x_t; differentiable in the network's parameters.
-
-        The std is 0 on known entries. All entries are 0 at the last step, which is deterministic, and if ``eta`` is 0.
-        """
-        return self.transition(x_t, step, table, eta=eta)[:2]
 
     @torch.no_grad()
     def run_chain(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import os
@@ -19,7 +18,7 @@ from torch import Tensor
 from agents.configuration.prior_names import CONFIG_NAME, find_prior
 from agents.diffusion import Preconditioning, ResidualVariance
 from scene_envs.errors import CorruptFileError, InvalidInputError, SceneEnvsError, UnknownNameError, unknown_name
-from scene_envs.files import read_tensors, with_digest, without_digest, write_json, write_tensors
+from scene_envs.files import read_json, read_tensors, with_digest, write_json, write_tensors
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene_types import SceneType, get_scene_type, register_scene_type
 
@@ -62,16 +61,7 @@ def write_config(directory: Path, config: Mapping[str, Any]) -> None:
 
 def read_config(name: str | os.PathLike[str]) -> dict[str, Any]:
     """Configuration of a prior, compared with its digest and returned without it; errors as for :func:`read_prior`."""
-    file = find_prior(name) / CONFIG_NAME
-    try:
-        config: dict[str, Any] = json.loads(file.read_text())
-    except (ValueError, RecursionError) as error:
-        raise CorruptFileError(
-            f"{str(file)!r} is not valid JSON: {type(error).__name__}: {str(error)[:200]}"
-        ) from error
-    if not isinstance(config, dict):
-        raise CorruptFileError(f"{str(file)!r} holds no mapping, so it is not the configuration of a prior")
-    return without_digest(config, file)
+    return read_json(find_prior(name) / CONFIG_NAME)
 
 
 def count_parameters(name: str | os.PathLike[str]) -> int:

@@ -7,6 +7,7 @@ While a category is masked its K entries are zeros. (Pfaff et al., CoRL 2025; Hu
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -268,6 +269,16 @@ class MixedPrior(ScenePrior):
         fits = ~(present[:, None] & ~members).any(dim=-1)  # (B, M)
         allowed = (fits[..., None] & members).any(dim=1)
         return allowed | ~fits.any(dim=-1, keepdim=True)
+
+    def with_union(self, union: str) -> MixedPrior:
+        """This prior, whose scenes of a union hold the assets of ``"one_type"``, or ``"any"``; an UnknownNameError."""
+        self.config = replace(self.config, union=union)
+        return self
+
+    def with_open_empty(self, share: float) -> MixedPrior:
+        """This prior; in its training, ``share`` of the masks of whole slots include every empty slot."""
+        self.config = replace(self.config, open_empty_share=share)
+        return self
 
     # -- the reverse chain ------------------------------------------------------------------------
 

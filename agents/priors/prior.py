@@ -390,15 +390,13 @@ class ScenePrior(nn.Module, ABC):
     def with_union(self: Prior, union: str) -> Prior:
         """This prior, whose scenes of a union of scene types hold the assets of ``"one_type"``, or ``"any"`` assets.
 
-        A prior with continuous categories has no such setting and is not changed.
+        A prior with continuous categories has no such setting, and is not changed.
 
         Raises:
             UnknownNameError: another word.
         """
         if union not in UNIONS:
             raise unknown_name("union", union, UNIONS)
-        if hasattr(self.config, "union"):
-            self.config = replace(self.config, union=union)
         return self
 
     def with_physics_guidance(self: Prior, strength: float) -> Prior:
@@ -436,8 +434,6 @@ class ScenePrior(nn.Module, ABC):
 
         A prior whose network reads no observed entries has no such masks and is not changed.
         """
-        if hasattr(self.config, "open_empty_share"):
-            self.config = replace(self.config, open_empty_share=share)
         return self
 
     # -- the reverse chain ------------------------------------------------------------------------

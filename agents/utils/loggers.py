@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from scene_envs.errors import MissingDependencyError, unknown_name
+from scene_envs.errors import MissingDependencyError
 
 LOGGERS = ("csv", "tensorboard", "wandb")
 """Names of loggers."""
@@ -17,7 +17,7 @@ LOGGERS = ("csv", "tensorboard", "wandb")
 class RunLogger:
     """Logger of the rows of the run in ``folder``, beside ``log.csv``, which every run writes itself: ``csv`` adds
     nothing, ``tensorboard`` writes events to ``tensorboard/``, and ``wandb`` a run of Weights & Biases to ``wandb/``,
-    which ``wandb sync`` sends. An UnknownNameError for another name, a MissingDependencyError without the package.
+    which ``wandb sync`` sends. A MissingDependencyError without the package.
 
     >>> logger = RunLogger("csv", "runs/mine")
     >>> logger.log({"reward": 1.0}, step=1)
@@ -25,8 +25,6 @@ class RunLogger:
     """
 
     def __init__(self, name: str, folder: str | os.PathLike[str]) -> None:
-        if name not in LOGGERS:
-            raise unknown_name("logger", name, LOGGERS)
         self._logger: Any = None
         if name == "csv":
             return

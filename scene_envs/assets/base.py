@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -16,8 +18,9 @@ from scene_envs.errors import InvalidInputError, unknown_name
 if TYPE_CHECKING:
     import trimesh
 
-ASSET_GROUPS: dict[str, frozenset[str]] = {}
-"""Names of assets by group; the built-in ones are filled in with their recipes, from ``recipes/tables.json``."""
+_GROUPS = json.loads(Path(__file__).with_name("groups.json").read_text("utf-8"))
+ASSET_GROUPS: dict[str, frozenset[str]] = {name: frozenset(members) for name, members in _GROUPS.items()}
+"""Names of assets by group."""
 RECIPES: dict[str, RecipeEntry] = {}
 """Recipes registered so far, by asset name."""
 
@@ -45,6 +48,28 @@ def regular_plural(name: str) -> str:
     return f"{name}es" if re.search(r"(s|x|z|ch|sh)$", name, re.IGNORECASE) else f"{name}s"
 
 
+def identifiers(names: Iterable[str]) -> dict[str, str]:
+    """For each name, a unique identifier of letters, digits and underscores that does not start with a digit.
+
+    >>> identifiers(["tea cup", "tea-cup", "7up", "plate"])
+    {'tea cup': 'tea_cup', 'tea-cup': 'tea_cup_2', '7up': '_7up', 'plate': 'plate'}
+    """
+    found: dict[str, str] = {}
+    for name in names:
+        free, repeat = identifier(name), 1
+        while free in found.values():
+            repeat += 1
+            free = f"{identifier(name)}_{repeat}"
+        found[name] = free
+    return found
+
+
+def identifier(name: str) -> str:
+    """``name`` with everything but letters, digits and underscores replaced; it does not start with a digit."""
+    plain = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
+    return f"_{plain}" if plain[0].isdigit() else plain
+
+
 @dataclass(frozen=True)
 class ConvexPart:
     """One convex piece of collision geometry in the asset frame (m).
@@ -70,6 +95,33 @@ def bounds_of(parts: Sequence[ConvexPart]) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
+class Joint:
+    """A movable joint of a model and the link that it moves. At position 0 the link is where the asset shows it.
+
+    Attributes:
+        name: Its name in the file.
+        link: Name of the link.
+        parent: Row in :attr:`Asset.bodies` of what the link hangs on; 0 is the part that does not move.
+        kind: ``"revolute"`` or ``"prismatic"``.
+        pose: (4, 4) frame of the link, whose origin is on the axis, in the frame of its parent, m.
+        axis: (3,) unit vector in the frame of the link.
+        limits: Lowest and highest position, rad or m; infinite for a revolute joint without limits.
+        damping: N m s/rad or N s/m.
+        friction: N m or N.
+    """
+
+    name: str
+    link: str
+    parent: int
+    kind: Literal["revolute", "prismatic"]
+    pose: Array
+    axis: Array
+    limits: tuple[float, float]
+    damping: float = 0.0
+    friction: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class Asset:
     """One model of the library. Frame: z up, base at z = 0 unless its recipe has another frame.
 
@@ -85,6 +137,8 @@ class Asset:
         coarse: Fewer convex parts, used where the result is the same.
         color: (r, g, b) in 0..255, the class colour of semantic renders.
         static: True for tables, shelves and floors.
+        joints: Movable joints of a user's model, which exports keep where the asset is welded; each after its parent.
+        bodies: With joints, what does not move and then the link of each joint, in its own frame.
     """
 
     name: str
@@ -98,6 +152,8 @@ class Asset:
     coarse: tuple[ConvexPart, ...]
     color: tuple[int, int, int]
     static: bool = False
+    joints: tuple[Joint, ...] = ()
+    bodies: tuple[Asset, ...] = ()
 
     @cached_property
     def bounds(self) -> Array:

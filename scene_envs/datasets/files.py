@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
-from scene_envs.files import replacing, with_digest, without_digest, write_json, write_text
+from scene_envs.files import read_json, replacing, with_digest, without_digest, write_json, write_text
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE_FEATURES
 from scene_envs.scene_types import SceneType
@@ -36,6 +37,7 @@ _BLOCK = 2000
 """Largest number of scenes that are read at a time."""
 _STATE, _SPLITS = "state.json", "dataset_dict.json"
 _SUFFIXES = (".parquet", ".arrow")
+_REMEDY = "delete it and generate again to remake it"
 
 
 def shard_name(index: int) -> str:
@@ -101,15 +103,22 @@ def encode_shard(
     }
     if any(len(prompts) > 1 for prompts in prompt_sets):
         columns[PROMPT_SETS] = pa.array([list(prompts) for prompts in prompt_sets], pa.list_(pa.string()))
-    kept = json.dumps(with_digest({**notes, "rows": count}), sort_keys=True)
+    sums = _checksums((0, 0), scenes, prompt_sets)
+    kept = json.dumps(with_digest({**notes, "rows": count, "checksums": sums}), sort_keys=True)
     table = pa.table(columns).replace_schema_metadata({_NOTES: kept.encode()})
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, compression="zstd", row_group_size=_ROW_GROUP, write_page_checksum=True)
     return bytes(sink.getvalue().to_pybytes())
 
 
+def _checksums(before: Sequence[int], scenes: NDArray[Any], prompt_sets: Sequence[tuple[str, ...]]) -> list[int]:
+    """CRC-32 of scenes and of prompts of all rows so far. Those of parquet leave out headers of pages and footer."""
+    texts = "".join(f"{prompt}\0" for prompts in prompt_sets for prompt in (*prompts, ""))
+    return [zlib.crc32(np.ascontiguousarray(scenes).data, before[0]), zlib.crc32(texts.encode(), before[1])]
+
+
 @contextmanager
-def _reading(problem: str, remedy: str = "delete it and generate again to remake it") -> Iterator[None]:
+def _reading(problem: str, remedy: str = _REMEDY) -> Iterator[None]:
     """Context in which an error of arrow is a CorruptFileError that names the ``problem`` and the ``remedy``."""
     try:
         yield
@@ -117,9 +126,11 @@ def _reading(problem: str, remedy: str = "delete it and generate again to remake
         raise CorruptFileError(f"{problem} ({str(error)[:200]}); {remedy}") from error
 
 
-def read_notes(path: Path) -> dict[str, Any]:
-    """The facts that :func:`encode_shard` kept in the footer, and ``rows``; raises CorruptFileError."""
-    file = open_parquet(path)
+def read_notes(path: Path, file: pq.ParquetFile | None = None) -> dict[str, Any]:
+    """The facts that :func:`encode_shard` kept in the footer, ``rows`` and ``checksums``, of the open ``file`` if
+    it is given; raises CorruptFileError.
+    """
+    file = file or open_parquet(path)
     footer = file.schema_arrow.metadata or {}
     rows = file.metadata.num_rows
     with _reading(f"{str(path)!r} has a damaged footer"):
@@ -130,14 +141,6 @@ def read_notes(path: Path) -> dict[str, Any]:
         if notes.get("rows", rows) != rows:
             raise ValueError(f"{notes['rows']} rows were written, the file has {rows}")
     return {**notes, "rows": rows}
-
-
-def verify(path: Path) -> None:
-    """Read all of a shard, whose pages carry checksums; raises CorruptFileError."""
-    file = open_parquet(path)
-    with _reading(f"{str(path)!r} is damaged"):
-        for _ in file.iter_batches(_ROW_GROUP):
-            pass
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:
@@ -196,24 +199,32 @@ def find_metadata(path: str | os.PathLike[str]) -> Path:
 def read_rows(file: Path, features: int) -> Iterator[Rows]:
     """The rows of one file of D = ``features`` features per slot, a block at a time. Scenes may be lists of lists,
     fixed-size lists, Hugging Face ``Array2D``, or one flat list per scene, of half, single or double floats. Raises
-    CorruptFileError where the file cannot be read, columns are missing, or scenes have another width or gaps.
+    CorruptFileError where the file cannot be read, columns are missing, or scenes have another width or gaps, and at
+    the end of a file of this package whose rows are not those that were written.
     """
-    place, start = str(file), 0
+    place, start, sums, notes = str(file), 0, [0, 0], {}
     if file.suffix == ".arrow":
         table = _arrow_table(file)
         batches = iter(table.select(_columns(table.column_names, place)).to_batches(_BLOCK))
     else:
         parquet = open_parquet(file)
+        notes = read_notes(file, parquet)
         batches = parquet.iter_batches(_BLOCK, columns=_columns(parquet.schema_arrow.names, place))
     while True:
         with _reading(f"cannot read {place!r} from row {start} on"):
             batch = next(batches, None)
         if batch is None:
+            if notes.get("checksums", sums) != sums:
+                raise CorruptFileError(
+                    f"{place!r} is damaged: its rows are not those that were written; {_REMEDY}. If they were changed "
+                    "on purpose, write the file without the metadata of its schema"
+                )
             return
         if not batch.num_rows:
             continue
         with _reading(f"cannot read scenes of {features} features per slot from {place!r}"):
             scenes, prompt_sets = _to_array(batch[SCENES], features, start), _prompt_sets(batch)
+        sums = _checksums(sums, scenes, prompt_sets)
         yield Rows(scenes, prompt_sets, place, start)
         start += batch.num_rows
 
@@ -362,14 +373,9 @@ def read_metadata(path: str | os.PathLike[str]) -> DatasetInfo:
     file = Path(path) / METADATA if Path(path).is_dir() else Path(path)
     if not file.is_file():
         raise InvalidInputError(f"no {METADATA} at {str(file)!r}; a dataset folder holds one")
-    try:
-        metadata = json.loads(file.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CorruptFileError(f"{str(file)!r} is not valid JSON: {error}") from error
-    if isinstance(metadata, dict):
-        metadata = without_digest(metadata, file)
+    metadata = read_json(file)
     needed = ("model_paths", "normalizer_state")
-    missing = [key for key in needed if not isinstance(metadata, dict) or key not in metadata]
+    missing = [key for key in needed if key not in metadata]
     if missing:
         raise CorruptFileError(f"{str(file)!r} lacks the keys {missing}; a dataset's metadata needs {list(needed)}")
     for key in ("model_paths", "welded_object_model_paths"):

@@ -28,8 +28,8 @@ from scene_envs.datasets.files import (
     make_metadata,
     read_metadata,
     read_notes,
+    read_rows,
     shard_name,
-    verify,
     write_bytes,
     write_metadata,
 )
@@ -159,7 +159,7 @@ def generate(
     normalizer = _prepare(folder, grammar, settings)
     sizes = [min(shard_size, count - first) for first in range(0, count, shard_size)]
     jobs = [Job(index, size, seed, verify, folder / shard_name(index), physics) for index, size in enumerate(sizes)]
-    left = [job for job in jobs if not _is_made(job)]
+    left = [job for job in jobs if not _is_made(job, len(normalizer.scale))]
     with generation_progress(
         f"Generating {scene_type}", count - sum(job.size for job in left), count, progress
     ) as report:
@@ -286,14 +286,16 @@ def _prepare(folder: Path, grammar: Grammar, settings: dict[str, Any]) -> Normal
     return normalizer
 
 
-def _is_made(job: Job) -> bool:
+def _is_made(job: Job, features: int) -> bool:
     """Whether the shard exists; raises CorruptFileError when it is damaged or has another number of scenes."""
     if not job.path.is_file():
         return False
-    rows = read_notes(job.path)["rows"]
-    if rows != job.size:
-        raise CorruptFileError(f"{str(job.path)!r} holds {rows} scenes, expected {job.size}; delete it and run again")
-    verify(job.path)
+    notes = read_notes(job.path)
+    if notes["rows"] != job.size or "checksums" not in notes:
+        held = f"holds {notes['rows']} scenes, expected {job.size} with checksums"
+        raise CorruptFileError(f"{str(job.path)!r} {held}; delete it and run again")
+    for _ in read_rows(job.path, features):  # compares the checksums
+        pass
     return True
 
 

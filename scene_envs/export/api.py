@@ -5,20 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from scene_envs.assets.base import identifier
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.export.formats import _FORMATS, resolve_formats
-from scene_envs.export.placed import AssetFiles, identifier, place
-from scene_envs.export.randomization import randomize, read_randomization
+from scene_envs.export.placed import AssetFiles, PlacedObject, place
+from scene_envs.export.randomization import randomize, read_randomization, record
 from scene_envs.files import write_json
 from scene_envs.physics.parts import FRICTION
 from scene_envs.scene import SceneBatch
 
 MANIFEST = "export.json"
+_WITH_JOINTS = ("urdf", "sdf", "drake", "mjcf", "usd")
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,7 @@ class ExportReport:
         scenes: Main file of each format, for each scene.
         assets: Names of the assets in use.
         size: Size of the whole export, bytes.
+        notes: For each asset with joints, the formats in which they move and those in which they are frozen.
     """
 
     output: Path
@@ -38,6 +42,7 @@ class ExportReport:
     scenes: tuple[Mapping[str, Path], ...]
     assets: tuple[str, ...]
     size: int
+    notes: tuple[str, ...] = ()
 
 
 def export(
@@ -62,8 +67,8 @@ def export(
         formats: One or several names, or ``"all"`` for those with a file per scene that can be written here; see
             :func:`scene_envs.export.list_formats`.
         friction: Coulomb friction coefficient between any two surfaces; by default that of :mod:`scene_envs.physics`.
-        randomization: Distributions of mass, friction and colour (:mod:`scene_envs.export.randomization`);
-            ``randomization.json`` of each scene says what its objects got.
+        randomization: Distributions of mass, friction, colours, textures, light and camera
+            (:mod:`scene_envs.export.randomization`); ``randomization.json`` of each scene says what it got.
 
     Raises:
         UnknownNameError: no such format.
@@ -74,8 +79,12 @@ def export(
         raise InvalidInputError(f"friction must be a finite number >= 0, got {friction}")
     names = resolve_formats(formats)
     writers = {name: _FORMATS[name].writer() for name in names}
-    settings = read_randomization(randomization, names)
-    placed = [randomize(scene, settings) for scene in place(batch, friction)]
+    settings = read_randomization(randomization)
+    seen: Counter[bytes] = Counter()
+    placed = []
+    for scene in place(batch, friction):
+        placed.append(randomize(scene, settings, seen[scene.digest]))
+        seen[scene.digest] += 1
     root = Path(output)
     manifest = _claim(root, batch, friction, settings)
     package = f"{identifier(batch.scene_type.name)}_{manifest['digest'][:8]}"
@@ -86,8 +95,8 @@ def export(
         folder = root / place_of
         folder.mkdir(exist_ok=True)
         if settings:
-            values = {x.name: {"mass": x.mass, "friction": x.friction, "color": x.color} for x in scene.objects}
-            write_json(folder / "randomization.json", {**settings, "verdict": "nominal", "objects": values})
+            content = record(scene, settings, sorted({*manifest["formats"], *names}))
+            write_json(folder / "randomization.json", content)
         scenes.append({name: whole.get(name) or write(scene, files, folder) for name, write in writers.items()})
         if not any(folder.iterdir()):
             folder.rmdir()
@@ -98,7 +107,17 @@ def export(
         path for top in ("worlds.*", "assets/**/*", "scene_[0-9]*", "scene_[0-9]*/**/*") for path in root.glob(top)
     ]
     size = sum(path.stat().st_size for path in written if path.is_file())
-    return ExportReport(root, names, tuple(scenes), used, size)
+    jointed = {item.asset.name: item for scene in placed for item in scene.objects if item.asset.joints}
+    notes = tuple(_joints_in(names, item) for item in jointed.values())
+    return ExportReport(root, names, tuple(scenes), used, size, notes)
+
+
+def _joints_in(formats: Sequence[str], item: PlacedObject) -> str:
+    moving = [name for name in formats if name in _WITH_JOINTS and item.joints]
+    frozen = [name for name in formats if name not in moving]
+    verbs = [f"{verb} in {', '.join(some)}" for verb, some in (("move", moving), ("are frozen", frozen)) if some]
+    free = "" if item.joints else ", because it is not welded"
+    return f"{item.asset.name}: its joints ({', '.join(j.name for j in item.asset.joints)}) {' and '.join(verbs)}{free}"
 
 
 def scene_folders(count: int) -> tuple[str, ...]:
@@ -157,4 +176,5 @@ def _digest(batch: SceneBatch) -> str:
         digest.update(asset.inertia.tobytes() + asset.center_of_mass.tobytes())
         for part in asset.fine:
             digest.update(part.vertices.tobytes())
+        digest.update(repr(asset.joints).encode() if asset.joints else b"")
     return digest.hexdigest()[:16]

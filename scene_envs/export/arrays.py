@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
-from scene_envs.export.placed import AssetFiles, PlacedScene, textured_mesh
+from scene_envs.export.placed import AssetFiles, PlacedScene, linear, textured_mesh
 
 Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """World frame (z up) to the frame of glTF (y up)."""
@@ -39,10 +39,14 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene.glb``: a node per object under a node ``z_up``, which turns the world frame to that of glTF."""
     graph = trimesh.Scene(base_frame="world")
     graph.graph.update("z_up", "world", matrix=Y_UP)
-    for asset in scene.assets:
-        graph.geometry[files.name(asset)] = textured_mesh(asset)
     for item in scene.objects:
-        graph.graph.update(item.name, "z_up", matrix=item.matrix, geometry=files.name(item.asset))
+        name, mesh = files.look(item), textured_mesh(item.asset, item.texture)
+        if item.tinted:
+            name, mesh = f"{item.name}.color", mesh.copy()
+            visual: Any = mesh.visual
+            visual.material.baseColorFactor = np.rint(255.0 * np.append(linear(item.color), 1.0)).astype(np.uint8)
+        graph.geometry[name] = mesh
+        graph.graph.update(item.name, "z_up", matrix=item.matrix, geometry=name)
     path = folder / "scene.glb"
     path.write_bytes(export_glb(graph, include_normals=True))
     return path

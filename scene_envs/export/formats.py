@@ -45,17 +45,13 @@ class ExportFormat:
     install: str = ""
     whole: bool = False
 
-    def check(self) -> None:
-        """Raise MissingDependencyError where the module that the format requires is not installed."""
+    def writer(self) -> Any:
+        """The writer, imported; raises MissingDependencyError where the required module is not installed."""
         if self.requires and find_spec(self.requires) is None:
             raise MissingDependencyError(
                 f"format {self.name!r} needs {self.install}, which is not installed; "
                 f"install it with `pip install {self.install}`, or leave {self.name!r} out of formats="
             )
-
-    def writer(self) -> Any:
-        """The writer, imported; raises MissingDependencyError where the required module is not installed."""
-        self.check()
         if not isinstance(self.write, str):
             return self.write
         module, _, function = self.write.partition(":")
@@ -113,14 +109,6 @@ def resolve_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     >>> resolve_formats(["mjcf", "npz", "mjcf"])
     ('mjcf', 'npz')
     """
-    names = check_formats(formats)
-    for name in names:
-        _FORMATS[name].writer()
-    return names
-
-
-def check_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
-    """As :func:`resolve_formats`, without an import of the writers."""
     if formats == "all":
         formats_here = (f for f in _FORMATS.values() if not f.requires or find_spec(f.requires) is not None)
         return tuple(f.name for f in formats_here if not f.whole)
@@ -130,5 +118,5 @@ def check_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     if not names:
         raise InvalidInputError(f"formats is empty; give at least one of {', '.join(list_formats())}")
     for name in names:
-        _FORMATS[name].check()
+        _FORMATS[name].writer()
     return names

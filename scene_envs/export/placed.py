@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import re
+import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,12 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from trimesh.exchange.obj import export_obj
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from scene_envs.arrays import Array
-from scene_envs.assets.base import Asset, ConvexPart
+from scene_envs.assets.base import Asset, ConvexPart, Joint, identifiers
 from scene_envs.assets.shapes import convex_hull
+from scene_envs.errors import InvalidInputError
 from scene_envs.physics.parts import FRICTION, quaternions
-from scene_envs.scene_types import SceneType
+from scene_envs.render.raster import Pinhole
+from scene_envs.scene_types import Camera, SceneType
 
 if TYPE_CHECKING:
     from scene_envs.scene import SceneBatch
@@ -26,6 +31,31 @@ if TYPE_CHECKING:
 _MAX_COLORS = 1024
 _CELL = 4
 """Width of a colour's cell in the palette, pixels."""
+_PATTERN = 256
+"""Width and height of a procedural texture, pixels."""
+TEXTURES = ("none", "checker", "gradient", "flat")
+"""An object's own colours, or a pattern in place of them: 8 by 8 cells of white and grey, white to grey, or white."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """A far lamp.
+
+    Attributes:
+        direction: Unit vector (x, y, z) in which it shines, world frame.
+        intensity: Factor of the brightness that a format gives its lamp.
+        color: Red, green and blue, 0 to 1.
+    """
+
+    direction: tuple[float, ...] = (-0.2, 0.3, -1.0)
+    intensity: float = 1.0
+    color: tuple[float, ...] = (1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        length = float(np.linalg.norm(self.direction))
+        if not length > 1e-9:
+            raise InvalidInputError(f"a lamp shines in no direction: {self.direction} has no length")
+        object.__setattr__(self, "direction", tuple(x / length for x in self.direction))
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +73,8 @@ class PlacedObject:
         mass: kg.
         inertia: (3, 3) kg m^2 about the centre of mass, asset frame.
         friction: Coefficient of friction.
-        color: Factors of red, green and blue, 0 to 1, on the colours of the asset.
+        color: Factors of red, green and blue, 0 to 1, on the colours of the asset or of its texture.
+        texture: One of ``TEXTURES``.
     """
 
     name: str
@@ -57,6 +88,12 @@ class PlacedObject:
     inertia: Array
     friction: float
     color: tuple[float, ...] = (1.0, 1.0, 1.0)
+    texture: str = "none"
+
+    @property
+    def tinted(self) -> bool:
+        """Whether the colour is another than the asset's or the texture's."""
+        return min(self.color) < 1.0
 
     @cached_property
     def quaternion(self) -> Array:
@@ -70,6 +107,32 @@ class PlacedObject:
         matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
         return matrix
 
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """The joints that move while the object stays where it is; none of a free object."""
+        return self.asset.joints if self.welded else ()
+
+    @cached_property
+    def pieces(self) -> tuple[PlacedObject, ...]:
+        """What does not move, at the pose of the object, and then the link of each joint, called ``cabinet_0/door``, at
+        its pose in the frame of its parent; the object itself where it has no joints.
+        """
+        if not self.joints:
+            return (self,)
+        found = [replace(self, asset=b, mass=b.mass, inertia=b.inertia) for b in self.asset.bodies]
+        for row, joint in enumerate(self.joints, start=1):
+            place: dict[str, Any] = {"translation": joint.pose[:3, 3], "rotation": joint.pose[:3, :3]}
+            found[row] = replace(found[row], name=f"{self.name}/{joint.link}", welded=False, **place)
+        return tuple(found)
+
+    @cached_property
+    def frames(self) -> list[Array]:
+        """(4, 4) of each piece in the frame of the object."""
+        found = [np.eye(4)]
+        for joint in self.joints:
+            found.append(found[joint.parent] @ joint.pose)
+        return found
+
 
 @dataclass(frozen=True, eq=False)
 class PlacedScene:
@@ -80,18 +143,38 @@ class PlacedScene:
         scene_type: Scene type of the scene.
         slots: Number of rows of the scene, empty ones included.
         objects: Objects in slot order.
+        light: Lamp of the scene.
+        own_camera: Camera of the scene in place of that of its type.
     """
 
     index: int
     scene_type: SceneType
     slots: int
     objects: tuple[PlacedObject, ...]
+    light: Light = Light()
+    own_camera: Camera | None = None
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Digest (32 bytes) of the poses."""
+        return hashlib.sha256(b"".join(item.matrix.tobytes() for item in self.objects)).digest()
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the scene."""
+        return self.own_camera or self.scene_type.camera
 
     @property
     def assets(self) -> tuple[Asset, ...]:
         """The assets in use, each once, in category order."""
         used = {item.category: item.asset for item in self.objects}
         return tuple(used[category] for category in sorted(used))
+
+    @property
+    def bodies(self) -> tuple[Asset, ...]:
+        """As ``assets``, with the bodies of those whose joints move in their place."""
+        used = {item.category: [piece.asset for piece in item.pieces] for item in self.objects}
+        return tuple(asset for category in sorted(used) for asset in used[category])
 
 
 def place(batch: SceneBatch, friction: float = FRICTION) -> list[PlacedScene]:
@@ -143,28 +226,6 @@ def place(batch: SceneBatch, friction: float = FRICTION) -> list[PlacedScene]:
     return scenes
 
 
-def identifiers(names: Iterable[str]) -> dict[str, str]:
-    """For each name, a unique identifier of letters, digits and underscores that does not start with a digit.
-
-    >>> identifiers(["tea cup", "tea-cup", "7up", "plate"])
-    {'tea cup': 'tea_cup', 'tea-cup': 'tea_cup_2', '7up': '_7up', 'plate': 'plate'}
-    """
-    found: dict[str, str] = {}
-    for name in names:
-        free, repeat = identifier(name), 1
-        while free in found.values():
-            repeat += 1
-            free = f"{identifier(name)}_{repeat}"
-        found[name] = free
-    return found
-
-
-def identifier(name: str) -> str:
-    """``name`` with everything but letters, digits and underscores replaced; it does not start with a digit."""
-    plain = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
-    return f"_{plain}" if plain[0].isdigit() else plain
-
-
 def exact_rotations(matrices: NDArray[np.floating]) -> Array:
     """Nearest rotations (..., 3, 3) in double precision, orthonormal to a few 1e-16. The SVD leaves an error of some
     1e-16 per entry; one Newton step of the polar decomposition halves it.
@@ -188,11 +249,19 @@ def angle_axis(rotation: Array) -> tuple[float, Array]:
     >>> round(angle, 12), axis.round(12).tolist()
     (90.0, [0.0, 1.0, 0.0])
     """
-    w, *vector = quaternion(rotation).tolist()
-    length = float(np.linalg.norm(vector))
-    if length == 0.0:
-        return 0.0, np.array([0.0, 0.0, 1.0])
-    return float(np.degrees(2.0 * np.arctan2(length, w))), np.array(vector) / length
+    vector: Array = Rotation.from_matrix(rotation).as_rotvec()
+    angle = float(np.linalg.norm(vector))
+    return float(np.degrees(angle)), vector / angle if angle else np.array([0.0, 0.0, 1.0])
+
+
+def camera_axes(position: Any, target: Any, up: Any) -> Array:
+    """(3, 3): columns right, up and backward of a camera at ``position`` (3,) that looks at ``target`` (3,), as OpenGL
+    has them; ``up`` (3,).
+
+    >>> camera_axes((0.0, 0.0, 2.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)).round(12).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    return Pinhole.at(position, target, up, 45.0, 1, 1).pose[:3, :3] * [1.0, -1.0, -1.0] + 0.0
 
 
 def number(value: float) -> str:
@@ -223,12 +292,16 @@ class AssetFiles:
         self.root = folder
         self.friction = friction
         self.package = package
-        self._names = identifiers(asset.name for asset in assets)
+        self._names = identifiers(one.name for many in (assets, *(a.bodies for a in assets)) for one in many)
         self._done: dict[tuple[str, str], Any] = {}
 
     def name(self, asset: Asset) -> str:
         """The asset's name as an identifier, which is also the name of its folder."""
         return self._names[asset.name]
+
+    def look(self, item: PlacedObject) -> str:
+        """Name of an object's asset with its texture: ``teacup``, or ``teacup.checker``."""
+        return self.name(item.asset) + ("" if item.texture == "none" else f".{item.texture}")
 
     def folder(self, asset: Asset) -> Path:
         """Folder of the asset's files."""
@@ -243,9 +316,12 @@ class AssetFiles:
             self._done[key] = write(self.folder(asset))
         return self._done[key]
 
-    def visual(self, asset: Asset) -> Path:
-        """``visual.obj`` with normals, its colours in ``visual.png``; one material, ``visual.mtl``."""
-        return self.once(asset, "visual", lambda folder: _write_visual(visual_mesh(asset), folder))
+    def visual(self, asset: Asset, texture: str = "none") -> Path:
+        """``visual.obj`` with normals, its colours in ``visual.png``; one material, ``visual.mtl``. With a texture of
+        ``TEXTURES`` the three are ``visual_checker`` and so on.
+        """
+        name = "visual" if texture == "none" else f"visual_{texture}"
+        return self.once(asset, name, lambda folder: _write_visual(textured_mesh(asset, texture), folder / name))
 
     def parts(self, asset: Asset) -> list[Path]:
         """``part_00.obj`` …, the fine convex parts."""
@@ -275,46 +351,58 @@ def visual_mesh(asset: Asset) -> trimesh.Trimesh:
     return joined
 
 
-@dataclass(frozen=True, eq=False)
-class Palette:
-    """The colours of a mesh as a texture with one cell per colour."""
+@lru_cache(maxsize=64)
+def textured_mesh(asset: Asset, texture: str = "none") -> trimesh.Trimesh:
+    """The asset's mesh with one image on a matt material: a palette of its colours, for which corners of several
+    colours are split, or the pattern ``texture``.
+    """
+    from PIL import Image
 
-    image: NDArray[np.uint8]  # (H, W, 3) the texture
-    uv: Array  # (K, 2) middle of each cell, v upward
-    cells: NDArray[np.int64]  # (F,) cell of each face
-
-    @classmethod
-    def of(cls, mesh: trimesh.Trimesh) -> Palette:
-        """The palette of a mesh, of at most 1024 colours; if there are more, they are rounded."""
+    mesh = visual_mesh(asset)
+    if texture == "none":
         colors, cells = np.unique(_few_colors(face_colors(mesh)), axis=0, return_inverse=True)
         side = int(np.ceil(np.sqrt(len(colors))))
         pixels = np.zeros((side * side, 3), dtype=np.uint8)
         pixels[: len(colors)] = colors
         image = pixels.reshape(side, side, 3).repeat(_CELL, axis=0).repeat(_CELL, axis=1)
-        index = np.arange(len(colors))
-        uv = np.stack([(index % side + 0.5) / side, 1.0 - (index // side + 0.5) / side], axis=1)
-        return cls(image, uv, cells.ravel())
-
-
-@lru_cache(maxsize=64)
-def textured_mesh(asset: Asset) -> trimesh.Trimesh:
-    """The asset's mesh with a palette texture on a matt material; corners of several colours are split."""
-    from PIL import Image
-
-    mesh = visual_mesh(asset)
-    palette = Palette.of(mesh)
-    corners = np.stack([mesh.faces, np.repeat(palette.cells[:, None], 3, axis=1)], axis=-1).reshape(-1, 2)
-    unique, faces = np.unique(corners, axis=0, return_inverse=True)
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(palette.image), metallicFactor=0.0, roughnessFactor=0.7
-    )
+        corners = np.stack([mesh.faces, np.repeat(cells.reshape(-1, 1), 3, axis=1)], axis=-1).reshape(-1, 2)
+        unique, faces = np.unique(corners, axis=0, return_inverse=True)
+        vertices, cell = unique.T
+        uv = np.stack([(cell % side + 0.5) / side, 1.0 - (cell // side + 0.5) / side], axis=1)  # v is upward
+    else:
+        vertices, faces, uv, image = np.arange(len(mesh.vertices)), mesh.faces, pattern_uv(mesh), _pattern(texture)
+    material = PBRMaterial(baseColorTexture=Image.fromarray(image), metallicFactor=0.0, roughnessFactor=0.7)
     return trimesh.Trimesh(
-        mesh.vertices[unique[:, 0]],
+        mesh.vertices[vertices],
         faces.reshape(-1, 3),
-        vertex_normals=mesh.vertex_normals[unique[:, 0]],
-        visual=trimesh.visual.TextureVisuals(uv=palette.uv[unique[:, 1]], material=material),
+        vertex_normals=mesh.vertex_normals[vertices],
+        visual=trimesh.visual.TextureVisuals(uv=uv, material=material),
         process=False,
     )
+
+
+def pattern_uv(mesh: trimesh.Trimesh) -> Array:
+    """(V, 2) in 0..1: where a pattern lies on a mesh, by an oblique projection, which has no seams; v is upward."""
+    x, y, z = np.asarray(mesh.vertices, dtype=np.float64).T
+    across = np.stack([x + y, z + 0.5 * (y - x)], axis=1)
+    low = across.min(axis=0)
+    return (across - low) / np.maximum(np.ptp(across, axis=0), 1e-12)  # type: ignore[no-any-return]
+
+
+def _pattern(texture: str) -> NDArray[np.uint8]:
+    rows, columns = np.indices((_PATTERN, _PATTERN))
+    share = {
+        "checker": np.where((8 * rows // _PATTERN + 8 * columns // _PATTERN) % 2, 0.4, 1.0),
+        "gradient": 1.0 - 0.7 * rows / _PATTERN,
+        "flat": np.ones(rows.shape),
+    }[texture]
+    return np.rint(255.0 * share[..., None].repeat(3, axis=2)).astype(np.uint8)
+
+
+def linear(colors: Any) -> Array:
+    """Colours in 0..1 as formats keep them that light linearly, such as USD and glTF, from those of screens (sRGB)."""
+    colors = np.asarray(colors, dtype=np.float64)
+    return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
 
 
 def face_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8]:
@@ -338,22 +426,17 @@ def _write_parts(parts: Sequence[ConvexPart], folder: Path, prefix: str) -> list
     return paths
 
 
-def _write_visual(mesh: trimesh.Trimesh, folder: Path) -> Path:
-    """The mesh with one texture cell per colour: most loaders read textures, and few read colours of vertices."""
-    from PIL import Image
-
-    palette = Palette.of(mesh)
-    Image.fromarray(palette.image).save(folder / "visual.png")
-    (folder / "visual.mtl").write_text("newmtl palette\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd visual.png\n")
-    lines = ["mtllib visual.mtl", "usemtl palette"]
-    lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in (mesh.vertices + 0.0).tolist()]
-    lines += [f"vn {x:.5g} {y:.5g} {z:.5g}" for x, y, z in (mesh.vertex_normals + 0.0).tolist()]
-    lines += [f"vt {u:.9g} {v:.9g}" for u, v in palette.uv.tolist()]
-    for (a, b, c), t in zip((mesh.faces + 1).tolist(), (palette.cells + 1).tolist(), strict=True):
-        lines.append(f"f {a}/{t}/{a} {b}/{t}/{b} {c}/{t}/{c}")
-    path = folder / "visual.obj"
-    path.write_text("\n".join(lines) + "\n")
-    return path
+def _write_visual(mesh: trimesh.Trimesh, path: Path) -> Path:
+    """The mesh with its image: most loaders read textures, and few read colours of vertices."""
+    shown, white = mesh.copy(), [255, 255, 255, 255]
+    visual: Any = shown.visual
+    material = SimpleMaterial(visual.material.baseColorTexture, white, white, [0, 0, 0, 255], name=path.name)
+    shown.visual = trimesh.visual.TextureVisuals(visual.uv, material)
+    mtl = f"{path.name}.mtl"
+    text, others = export_obj(shown, include_normals=True, return_texture=True, mtl_name=mtl, header=None, digits=7)
+    for name, data in {**others, f"{path.name}.obj": text.encode()}.items():
+        path.with_name(name).write_bytes(data)
+    return path.with_suffix(".obj")
 
 
 def _few_colors(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:

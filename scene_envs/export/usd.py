@@ -12,14 +12,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import RECIPES, Asset
-from scene_envs.export.placed import AssetFiles, PlacedScene, face_colors, quaternion, visual_mesh
+from scene_envs.export.placed import (
+    AssetFiles,
+    Light,
+    PlacedObject,
+    PlacedScene,
+    camera_axes,
+    face_colors,
+    linear,
+    pattern_uv,
+    quaternion,
+    visual_mesh,
+)
 from scene_envs.export.urdf import relative
 from scene_envs.physics.mujoco import SOLIMP, SOLREF, TIMESTEP
 from scene_envs.physics.parts import GRAVITY, principal_inertia
-from scene_envs.scene_types import SceneType
+from scene_envs.scene_types import Camera, SceneType
 
 _SCENE = {
     "mjc:option:cone": ("token", "elliptic"),
@@ -39,6 +52,8 @@ _QCODES = {
 }  # fmt: skip
 """Wikidata items by a word of the asset's name."""
 _PHYSICAL_OBJECT = "Q223557"
+_LAMP, _SKY = 1000.0, 300.0
+"""Intensities (nit) of the lamp, and of the light from all sides that is with it."""
 _THUMBNAIL = 256
 """Width and height of an asset's picture, pixels."""
 
@@ -46,7 +61,9 @@ _THUMBNAIL = 256
 def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     """``scene_000.usda`` beside the folder ``assets``, so that every reference stays below the file's own folder.
 
-    One prim under ``/World`` per object; welded ones are colliders without a rigid body; units m and kg, z up.
+    One prim under ``/World`` per object; welded ones are colliders without a rigid body; units m and kg, z up. With
+    joints, the prim is an articulation of a prim for each link, and a fixed joint holds the first at the world. A light
+    or a camera that was drawn for the scene is ``/World/lamp``, with ``/World/sky``, or ``/World/camera``.
     """
     from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics
 
@@ -61,23 +78,120 @@ def write_scene(scene: PlacedScene, files: AssetFiles, folder: Path) -> Path:
     _apply(physics, "MjcSceneAPI", _SCENE)
     _apply(physics, "NewtonSceneAPI", {"newton:timeStepsPerSecond": ("int", round(1.0 / TIMESTEP))})
     for item in scene.objects:
-        body = UsdGeom.Xform.Define(stage, f"/World/{item.name}")
-        asset_file = files.once(item.asset, "usd", partial(_write_asset, item.asset, files, scene.scene_type))
-        body.GetPrim().GetReferences().AddReference(Sdf.Reference(f"./{relative(asset_file, path.parent)}"))
-        body.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*item.translation.tolist()))
-        w, x, y, z = item.quaternion.tolist()
-        body.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
-        if item.welded:  # MuJoCo and Newton read rigidBodyEnabled=false as a free body
-            body.GetPrim().RemoveAPI(UsdPhysics.RigidBodyAPI)
-            body.GetPrim().RemoveAPI(UsdPhysics.MassAPI)
-        elif item.mass != item.asset.mass:
-            _apply_body(body.GetPrim(), replace(item.asset, mass=item.mass, inertia=item.inertia))
-        if item.friction != files.friction:
-            surface = UsdPhysics.MaterialAPI.Apply(stage.OverridePrim(f"/World/{item.name}/surface"))
-            surface.CreateStaticFrictionAttr(item.friction)
-            surface.CreateDynamicFrictionAttr(item.friction)
+        prims = [_place(UsdGeom.Xform.Define(stage, f"/World/{item.name}"), item.matrix)]
+        if item.joints:
+            names = [files.name(item.asset), *(joint.link for joint in item.joints)]
+            prims = [
+                _place(UsdGeom.Xform.Define(stage, f"/World/{item.name}/{name}"), frame)
+                for name, frame in zip(names, item.frames, strict=True)
+            ]
+            _add_joints(stage, item, [prim.GetPath() for prim in prims])
+        for prim, piece in zip(prims, item.pieces, strict=True):
+            asset_file = files.once(piece.asset, "usd", partial(_write_asset, piece.asset, files, scene.scene_type))
+            prim.GetReferences().AddReference(Sdf.Reference(f"./{relative(asset_file, path.parent)}"))
+            if item.welded and not item.joints:  # MuJoCo and Newton read rigidBodyEnabled=false as a free body
+                prim.RemoveAPI(UsdPhysics.RigidBodyAPI)
+                prim.RemoveAPI(UsdPhysics.MassAPI)
+            elif piece.mass != piece.asset.mass:
+                _apply_body(prim, replace(piece.asset, mass=piece.mass, inertia=piece.inertia))
+            if item.friction != files.friction:
+                surface = UsdPhysics.MaterialAPI.Apply(stage.OverridePrim(prim.GetPath().AppendChild("surface")))
+                surface.CreateStaticFrictionAttr(item.friction)
+                surface.CreateDynamicFrictionAttr(item.friction)
+            if piece.tinted or piece.texture != "none":
+                _change_look(stage, str(prim.GetPath()), piece, files, path.parent)
+    if scene.light != Light():
+        _add_light(stage, scene.light)
+    if scene.camera != scene.scene_type.camera:
+        _add_camera(stage, scene.camera)
     stage.GetRootLayer().Save()
     return path
+
+
+def _change_look(stage: Any, prim: str, item: PlacedObject, files: AssetFiles, folder: Path) -> None:
+    """The object's texture and colour over those of its asset: a palette without, and an image with a texture."""
+    from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
+
+    if item.texture == "none":
+        palette = np.unique(face_colors(visual_mesh(item.asset)), axis=0) / 255.0
+        colors = Vt.Vec3fArray.FromNumpy(linear(palette * item.color).astype(np.float32))
+        UsdGeom.PrimvarsAPI(stage.OverridePrim(f"{prim}/visual")).GetPrimvar("displayColor").Set(colors)
+        return
+    reader = _define_shader(stage, f"{prim}/surface/st", "UsdPrimvarReader_float2", {"varname": ("String", "st")})
+    image = f"./{relative(files.visual(item.asset, item.texture).with_suffix('.png'), folder)}"
+    values = {"file": ("Asset", image), "scale": ("Float4", Gf.Vec4f(*linear(item.color).tolist(), 1.0))}
+    texture = _define_shader(stage, f"{prim}/surface/texture", "UsdUVTexture", values)
+    place = texture.CreateInput("st", Sdf.ValueTypeNames.Float2)
+    place.ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float2))
+    shader = UsdShade.Shader(stage.OverridePrim(f"{prim}/surface/shader"))
+    color = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+    color.ConnectToSource(texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
+
+
+def _add_light(stage: Any, light: Light) -> None:
+    from pxr import Gf, UsdLux
+
+    up = np.eye(3)[np.argmin(np.abs(light.direction))]
+    lamp = UsdLux.DistantLight.Define(stage, "/World/lamp")
+    lamp.CreateIntensityAttr(_LAMP * light.intensity)
+    lamp.CreateColorAttr(Gf.Vec3f(*linear(light.color).tolist()))
+    pose = np.eye(4)
+    pose[:3, :3] = camera_axes(np.zeros(3), light.direction, up)
+    _place(lamp, pose)
+    UsdLux.DomeLight.Define(stage, "/World/sky").CreateIntensityAttr(_SKY)
+
+
+def _add_camera(stage: Any, camera: Camera) -> None:
+    from pxr import Gf, UsdGeom
+
+    view = UsdGeom.Camera.Define(stage, "/World/camera")
+    height = view.GetHorizontalApertureAttr().Get() * camera.height / camera.width
+    view.CreateVerticalApertureAttr(height)
+    view.CreateFocalLengthAttr(0.5 * height / float(np.tan(np.radians(camera.fov_y) / 2.0)))
+    view.CreateClippingRangeAttr(Gf.Vec2f(0.01, 1000.0))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = camera_axes(camera.position, camera.target, camera.up), camera.position
+    _place(view, pose)
+
+
+def _place(prim: Any, pose: Array) -> Any:
+    """The prim, put at a pose (4, 4) in the frame of the prim above it."""
+    from pxr import Gf, UsdGeom
+
+    prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*pose[:3, 3].tolist()))
+    prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(*quaternion(pose[:3, :3]).tolist()))
+    return prim.GetPrim()
+
+
+def _add_joints(stage: Any, item: PlacedObject, paths: list[Any]) -> None:
+    """The joints of the links at these paths, below the object, and one that holds the first at the world."""
+    from pxr import Gf, Sdf, UsdGeom, UsdPhysics
+
+    UsdPhysics.ArticulationRootAPI.Apply(stage.GetPrimAtPath(paths[0]))  # MuJoCo takes a prim of no link for a body
+    folder = UsdGeom.Scope.Define(stage, f"/World/{item.name}/joints").GetPath()
+    weld = UsdPhysics.FixedJoint.Define(stage, folder.AppendChild(f"{paths[0].name}_weld"))
+    made: list[tuple[Any, list[Any], Array, Array]] = [(weld, paths[:1], item.matrix, np.eye(4))]
+    for path, joint in zip(paths[1:], item.joints, strict=True):
+        is_slide = joint.kind == "prismatic"
+        kind = UsdPhysics.PrismaticJoint if is_slide else UsdPhysics.RevoluteJoint
+        found = kind.Define(stage, folder.AppendChild(joint.name))
+        turn = np.eye(4)  # from the x axis to that of the joint
+        turn[:3, :3] = Rotation.align_vectors(joint.axis, (1.0, 0.0, 0.0))[0].as_matrix()
+        made.append((found, [paths[joint.parent], path], joint.pose @ turn, turn))
+        degrees = 1.0 if is_slide else np.degrees(1.0)
+        found.CreateAxisAttr(UsdPhysics.Tokens.x)
+        found.CreateLowerLimitAttr(joint.limits[0] * degrees)
+        found.CreateUpperLimitAttr(joint.limits[1] * degrees)
+        found.GetPrim().AddAppliedSchema("NewtonJointAPI")  # MuJoCo reads it as well
+        for key, value in (("damping", joint.damping / degrees), ("friction", joint.friction)):
+            found.GetPrim().CreateAttribute(f"newton:{key}", Sdf.ValueTypeNames.Float, False).Set(value)
+    for found, ends, *frames in made:
+        for end, relation in zip(reversed(ends), (found.CreateBody1Rel(), found.CreateBody0Rel()), strict=False):
+            relation.SetTargets([end])
+        for index, frame in enumerate(frames):
+            place, axes = Gf.Vec3f(*frame[:3, 3].tolist()), Gf.Quatf(*quaternion(frame[:3, :3]).tolist())
+            found.GetPrim().GetAttribute(f"physics:localPos{index}").Set(place)
+            found.GetPrim().GetAttribute(f"physics:localRot{index}").Set(axes)
 
 
 def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder: Path) -> Path:
@@ -98,12 +212,13 @@ def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder:
     material = _define_material(stage, f"/{name}/surface", files.friction)
     mesh = visual_mesh(asset)
     visual = _define_mesh(stage, f"/{name}/visual", mesh.vertices, mesh.faces)
-    colors = face_colors(mesh) / 255.0
-    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # USD keeps linear colour
-    primvar = UsdGeom.PrimvarsAPI(visual).CreatePrimvar(
-        "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.uniform
-    )
-    primvar.Set(Vt.Vec3fArray.FromNumpy(linear.astype(np.float32)))
+    palette, cells = np.unique(face_colors(mesh), axis=0, return_inverse=True)
+    primvars, names = UsdGeom.PrimvarsAPI(visual), Sdf.ValueTypeNames
+    primvar = primvars.CreatePrimvar("displayColor", names.Color3fArray, UsdGeom.Tokens.uniform)
+    primvar.Set(Vt.Vec3fArray.FromNumpy(linear(palette / 255.0).astype(np.float32)))
+    primvar.SetIndices(Vt.IntArray.FromNumpy(cells.ravel().astype(np.int32)))
+    place = primvars.CreatePrimvar("st", names.TexCoord2fArray, UsdGeom.Tokens.vertex)
+    place.Set(Vt.Vec2fArray.FromNumpy(pattern_uv(mesh).astype(np.float32)))
     visual.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.asarray(mesh.vertex_normals, dtype=np.float32)))
     visual.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     UsdShade.MaterialBindingAPI.Apply(visual.GetPrim()).Bind(material)
@@ -111,9 +226,7 @@ def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder:
     colliders.CreatePurposeAttr(UsdGeom.Tokens.guide)
     for index, part in enumerate(asset.fine):
         piece = _define_mesh(stage, f"/{name}/collision/part_{index:02d}", part.vertices, part.faces)
-        corners = part.vertices[part.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        normals = trimesh.Trimesh(part.vertices, part.faces, process=False).face_normals
         piece.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
         piece.SetNormalsInterpolation(UsdGeom.Tokens.uniform)
         piece.CreateDisplayColorAttr([Gf.Vec3f(0.4, 0.7, 0.4)])
@@ -126,7 +239,8 @@ def _write_asset(asset: Asset, files: AssetFiles, scene_type: SceneType, folder:
         binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
     stage.GetRootLayer().customLayerData = _metadata(asset, code)
     stage.GetRootLayer().Save()
-    _write_thumbnail(asset, scene_type, path.parent / ".thumbs" / "256x256" / f"{path.name}.png")
+    if asset.name in scene_type.library.names:
+        _write_thumbnail(asset, scene_type, path.parent / ".thumbs" / "256x256" / f"{path.name}.png")
     return path
 
 
@@ -172,21 +286,28 @@ def _define_material(stage: Any, path: str, friction: float) -> Any:
 
     material = UsdShade.Material.Define(stage, path)
     _label(material, "material", "unspecified")
-    reader = UsdShade.Shader.Define(stage, f"{path}/colors")
-    reader.CreateIdAttr("UsdPrimvarReader_float3")
-    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
-    reader.CreateInput("fallback", Sdf.ValueTypeNames.Float3).Set(Gf.Vec3f(0.5, 0.5, 0.5))
-    shader = UsdShade.Shader.Define(stage, f"{path}/shader")
-    shader.CreateIdAttr("UsdPreviewSurface")
+    values = {"varname": ("String", "displayColor"), "fallback": ("Float3", Gf.Vec3f(0.5, 0.5, 0.5))}
+    reader = _define_shader(stage, f"{path}/colors", "UsdPrimvarReader_float3", values)
+    values = {"roughness": ("Float", 0.7), "metallic": ("Float", 0.0)}
+    shader = _define_shader(stage, f"{path}/shader", "UsdPreviewSurface", values)
     color = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
     color.ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float3))
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.7)
-    shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
     material.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
     surface = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
     surface.CreateStaticFrictionAttr(friction)
     surface.CreateDynamicFrictionAttr(friction)
     return material
+
+
+def _define_shader(stage: Any, path: str, kind: str, values: dict[str, tuple[str, Any]]) -> Any:
+    """A shader of the given kind; values (type, value) by input."""
+    from pxr import Sdf, UsdShade
+
+    shader = UsdShade.Shader.Define(stage, path)
+    shader.CreateIdAttr(kind)
+    for name, (kind_of, value) in values.items():
+        shader.CreateInput(name, getattr(Sdf.ValueTypeNames, kind_of)).Set(value)
+    return shader
 
 
 def _define_mesh(stage: Any, path: str, vertices: Array, faces: Any) -> Any:

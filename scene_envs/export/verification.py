@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.export.api import MANIFEST, read_manifest, scene_folders
+from scene_envs.export.randomization import PHYSICS
 from scene_envs.files import write_json, write_text
 from scene_envs.physics.parts import FRICTION, GRAVITY, angle_between
 
@@ -91,7 +92,7 @@ def verify(path: str | os.PathLike[str]) -> Verification:
             missing[judge] = f"not installed: pip install {package}"
         elif not all(path.is_file() for path in paths):
             missing[judge] = f"no {file.format(scenes[0] if scenes else 'scene').rpartition('/')[2]} in the export"
-        elif file == _POSES and (manifest["friction"] != FRICTION or manifest.get("randomization")):
+        elif file == _POSES and (manifest["friction"] != FRICTION or PHYSICS & {*manifest.get("randomization", ())}):
             missing[judge] = "has other friction or masses than the files"
         else:
             found = importlib.metadata.distributions(name=package.strip('"').partition("[")[0])
@@ -192,24 +193,34 @@ def _pybullet(path: Path) -> Objects:
     import pybullet
     from pybullet_utils.bullet_client import BulletClient
 
-    client, bodies, pairs = BulletClient(pybullet.DIRECT), {}, []
+    client, pairs = BulletClient(pybullet.DIRECT), []
+    links: dict[str, tuple[int, int]] = {}  # a body and its joint that moves it, -1 for none
     client.setGravity(0.0, 0.0, -GRAVITY)
     for item in json.loads(path.read_text())["objects"]:
         file, turn = str(path.parent / item["bullet_urdf"]), np.roll(item["quaternion_wxyz"], -1).tolist()
         keys = {"useFixedBase": item["welded"], "flags": pybullet.URDF_USE_INERTIA_FROM_FILE}
         body = client.loadURDF(file, item["translation"], turn, **keys)
-        bodies[item["name"]] = body, client.invertTransform(*client.getDynamicsInfo(body, -1)[3:5])
+        links[item["name"]] = body, -1
+        for joint in range(client.getNumJoints(body)):  # what holds it is the friction of the file, and no motor
+            found = client.getJointInfo(body, joint)
+            client.setJointMotorControl2(body, joint, pybullet.VELOCITY_CONTROL, force=found[7])
+            links[f"{item['name']}/{found[12].decode()}"] = body, joint
     client.performCollisionDetection()
-    for name, (body, _) in bodies.items():
-        pairs += [(name, -contact[8]) for contact in client.getContactPoints(bodyA=body)]
+    for name, (body, link) in links.items():
+        pairs += [(name, -contact[8]) for contact in client.getContactPoints(bodyA=body, linkIndexA=link)]
 
     def after(seconds: float) -> ArrayLike:
         for _ in range(round(240 * seconds)):
             client.stepSimulation()
-        moved = [(*client.getBasePositionAndOrientation(body), *back) for body, back in bodies.values()]
-        return [np.concatenate(client.multiplyTransforms(*row)) for row in moved]  # it moves the frame of inertia
+        return [np.concatenate(pose(*link)) for link in links.values()]
 
-    return _objects(list(bodies), pairs, after)
+    def pose(body: int, joint: int) -> Any:
+        if joint >= 0:
+            return client.getLinkState(body, joint, computeForwardKinematics=True)[4:6]
+        back = client.invertTransform(*client.getDynamicsInfo(body, -1)[3:5])  # it moves the frame of inertia
+        return client.multiplyTransforms(*client.getBasePositionAndOrientation(body), *back)
+
+    return _objects(list(links), pairs, after)
 
 
 def _drake(path: Path) -> Objects:
@@ -226,7 +237,11 @@ def _drake(path: Path) -> Objects:
     diagram = builder.Build()
     simulator = drake.Simulator(diagram)
     context = plant.GetMyContextFromRoot(simulator.get_context())
-    bodies = {plant.GetModelInstanceName(m): plant.get_body(plant.GetBodyIndices(m)[0]) for m in models}
+    bodies: dict[str, Any] = {}
+    for model in models:
+        first, *links = map(plant.get_body, plant.GetBodyIndices(model))
+        name = plant.GetModelInstanceName(model)
+        bodies |= {name: first} | {f"{name}/{link.name()}": link for link in links}
     owner = {g: name for name, body in bodies.items() for g in plant.GetCollisionGeometriesForBody(body)}
     query = plant.get_geometry_query_input_port().Eval(context)
     found = query.ComputePointPairPenetration()

@@ -3,7 +3,9 @@ closed forms."""
 
 from __future__ import annotations
 
+import base64
 import json
+import re
 import struct
 from itertools import product
 from pathlib import Path
@@ -13,11 +15,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from scene_envs.assets import Asset, import_report, load_library
-from scene_envs.assets.importing.mesh_files import FORMATS, Model, cut_polygons
-from scene_envs.assets.importing.robot_files import read_sdf, read_urdf
+from scene_envs.assets.importing.mesh_files import FORMATS, Y_UP, Model, cut_polygons, read_mesh
+from scene_envs.assets.importing.robot_files import read_sdf, read_urdf, read_usd
 from scene_envs.errors import CorruptFileError, InvalidInputError
 from tests.helpers.model_files import BOX, POINTS, block, dae, gltf, triangles
 
@@ -117,14 +120,202 @@ def test_a_broken_look_of_a_dae_costs_no_geometry(tmp_path: Path, looks: str, ta
         assert np.unique(asset.visual.visual.vertex_colors[:, :3], axis=0).tolist() == [[230, 26, 26]]
 
 
-def test_a_skinned_mesh_is_named_and_other_meshes_are_read(tmp_path: Path) -> None:
+# -- skins ----------------------------------------------------------------------------------------
+
+
+def placed(angles: tuple[float, ...], place: tuple[float, ...]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", angles).as_matrix(), place
+    return pose
+
+
+FIRST, SECOND = placed((0.1, 0.2, 0.3), (0.5, 0, 0.2)), placed((0.7, 0, 0.2), (0, 0, 0.2))
+BINDS = [np.linalg.inv(placed((0, 0, 0.1), (0, 0, -0.2))), np.linalg.inv(placed((0.1, 0, 0), (0, 0.05, 0)))]
+ASIDE = placed((0.3, 0, 0), (3, 3, 3))  # pose of the node that holds the mesh, which a skin ignores
+SHAPE = placed((0.2, 0, 0), (0.01, 0, 0))
+ROD = trimesh.creation.box((0.2, 0.1, 0.4)).subdivide().subdivide()
+SHARE = np.clip(ROD.vertices[:, 2] / 0.4 + 0.5, 0, 1).astype("<f4")  # weight of the second joint
+
+
+def bent(shape: np.ndarray) -> trimesh.Trimesh:
+    """The rod in closed form: the mean of what each joint makes of it."""
+    moves = [joint @ bind @ shape for joint, bind in zip((FIRST, FIRST @ SECOND), BINDS, strict=True)]
+    first, second = (trimesh.transform_points(ROD.vertices, move) for move in moves)
+    return trimesh.Trimesh((1 - SHARE[:, None]) * first + SHARE[:, None] * second, ROD.faces, process=False)
+
+
+def skinned_gltf(form: str) -> bytes:
+    count = len(ROD.vertices)
+    weights = np.stack([1 - SHARE, SHARE, 0 * SHARE, 0 * SHARE], axis=1)
+    arrays = [
+        (ROD.vertices.astype("<f4"), 5126, "VEC3"), (ROD.faces.astype("<u2").reshape(-1), 5123, "SCALAR"),
+        (np.tile(np.array([0, 1, 0, 0], "u1"), (count, 1)), 5121, "VEC4"), (weights.astype("<f4"), 5126, "VEC4"),
+        (np.array([bind.T for bind in BINDS], "<f4"), 5126, "MAT4"),
+    ]  # fmt: skip
+    data, views, accessors = b"", [], []
+    for index, (array, kind, shape) in enumerate(arrays):
+        data += bytes(-len(data) % 4)
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
+        accessors.append({"bufferView": index, "componentType": kind, "count": len(array), "type": shape})
+        data += array.tobytes()
+    nodes = [{"mesh": 0, "skin": 0, "matrix": ASIDE.T.ravel().tolist()}, {"matrix": FIRST.T.ravel().tolist()}]
+    nodes[1]["children"], uri = [2], "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    primitive = {"attributes": {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}, "indices": 1}
+    header = {
+        "asset": {"version": "2.0"}, "buffers": [{"byteLength": len(data)} | ({"uri": uri} if form == "gltf" else {})],
+        "bufferViews": views, "accessors": accessors, "meshes": [{"name": "rod", "primitives": [primitive]}],
+        "skins": [{"joints": [1, 2], "inverseBindMatrices": 4}], "scenes": [{"nodes": [0, 1]}],
+        "nodes": [*nodes, {"matrix": SECOND.T.ravel().tolist()}],
+    }  # fmt: skip
+    text = json.dumps(header).encode()
+    text, data = text + b" " * (-len(text) % 4), data + bytes(-len(data) % 4)
+    head = struct.pack("<4s3I4s", b"glTF", 2, 28 + len(text) + len(data), len(text), b"JSON")
+    return text if form == "gltf" else head + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+
+
+def skinned_dae() -> str:
+    def row(values: Any) -> str:
+        return " ".join(map(repr, np.ravel(values).tolist()))
+
+    def source(name: str, kind: str, values: str, step: int, param: str) -> str:
+        count = len(values.split())
+        return (
+            f'<source id="{name}"><{kind}_array id="{name}a" count="{count}">{values}</{kind}_array><technique_common>'
+            f'<accessor source="#{name}a" count="{count // step}" stride="{step}"><param name="{param}" type="float"/>'
+            "</accessor></technique_common></source>"
+        )
+
+    count = len(ROD.vertices)
+    skin = f"""<library_controllers><controller id="k"><skin source="#g"><bind_shape_matrix>{row(SHAPE)}
+</bind_shape_matrix>{source("kj", "Name", "a b", 1, "JOINT")}{source("kb", "float", row(BINDS), 16, "TRANSFORM")}
+{source("kw", "float", row(np.stack([1 - SHARE, SHARE], axis=1)), 1, "WEIGHT")}<joints><input semantic="JOINT"
+source="#kj"/><input semantic="INV_BIND_MATRIX" source="#kb"/></joints><vertex_weights count="{count}"><input
+semantic="JOINT" source="#kj" offset="0"/><input semantic="WEIGHT" source="#kw" offset="1"/><vcount>{"2 " * count}
+</vcount><v>{" ".join(f"0 {2 * i} 1 {2 * i + 1}" for i in range(count))}</v></vertex_weights></skin></controller>
+</library_controllers>"""
+    nodes = f"""<matrix>{row(ASIDE)}</matrix><instance_controller url="#k"><skeleton>#a</skeleton></instance_controller>
+</node><node id="other"><node sid="a"/></node><node id="a" sid="a" type="JOINT"><matrix>{row(FIRST)}</matrix><node
+sid="b" type="JOINT"><matrix>{row(SECOND)}</matrix></node>"""
+    return dae(triangles(ROD), ROD.vertices.astype("<f4"), more=skin, node=nodes)
+
+
+@pytest.mark.parametrize(
+    ("form", "low", "high"),
+    [
+        ("gltf", [0.39507963, -0.23076328, 0.17537948], [0.74273872, 0.07163274, 0.55824341]),
+        ("glb", [0.39507963, -0.23076328, 0.17537948], [0.74273872, 0.07163274, 0.55824341]),
+        ("dae", [0.4007276, -0.24600523, 0.17066336], [0.75506969, 0.10769477, 0.53384486]),
+    ],
+)
+def test_a_skinned_mesh_is_where_its_joints_put_it(
+    tmp_path: Path, form: str, low: list[float], high: list[float]
+) -> None:
+    """As in closed form, and as the loaders of three.js 0.160 place it, whose bounds these are."""
     pytest.importorskip("collada")
-    skin = '<library_controllers><controller id="k"><skin source="#g"/></controller></library_controllers>'
-    nodes = '<instance_geometry url="#g"/><instance_controller url="#k"/>'
-    assert sizes(listed(tmp_path, "it.dae", dae(triangles(block()), block().vertices, more=skin, node=nodes))) == list(
-        BOX
-    )
-    assert "its skinned meshes are left out" in said(tmp_path)
+    path = tmp_path / f"it.{form}"
+    path.write_bytes(skinned_dae().encode() if form == "dae" else skinned_gltf(form))
+    (mesh,) = read_mesh(path)
+    expected = bent(SHAPE if form == "dae" else np.eye(4))
+    np.testing.assert_allclose(expected.bounds, [low, high], atol=1e-7)
+    turn = np.eye(3) if form == "dae" else Y_UP
+    gaps, _ = cKDTree(expected.vertices @ turn.T).query(mesh.vertices)
+    assert gaps.max() < 1e-6
+    asset = listed(tmp_path, path.name, path.read_bytes(), ", decomposition: convex")
+    assert asset.mass == pytest.approx(500 * expected.volume, rel=1e-5)
+    assert "not" not in said(tmp_path).partition("%")[0].replace("the file gives none", "")
+
+
+@pytest.mark.parametrize("is_instance", [False, True])
+def test_a_skinned_mesh_of_usd_is_where_its_joints_put_it(tmp_path: Path, is_instance: bool) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
+
+    def matrix(pose: np.ndarray) -> Any:
+        return Gf.Matrix4d(*pose.T.ravel().tolist())
+
+    path = tmp_path / "it.usda"
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    place = "/_rod" if is_instance else "/rod"
+    root, skeleton = UsdSkel.Root.Define(stage, place), UsdSkel.Skeleton.Define(stage, f"{place}/bones")
+    root.GetPrim().SetSpecifier(Sdf.SpecifierClass if is_instance else Sdf.SpecifierDef)
+    skeleton.CreateJointsAttr(["a", "a/b"])
+    skeleton.CreateBindTransformsAttr([matrix(np.linalg.inv(bind)) for bind in BINDS])
+    skeleton.CreateRestTransformsAttr([matrix(FIRST), matrix(SECOND)])
+    mesh = UsdGeom.Mesh.Define(stage, f"{place}/mesh")
+    mesh.AddTransformOp().Set(matrix(ASIDE))
+    mesh.CreatePointsAttr(ROD.vertices.tolist())
+    mesh.CreateFaceVertexCountsAttr([3] * len(ROD.faces))
+    mesh.CreateFaceVertexIndicesAttr(ROD.faces.ravel().tolist())
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    binding.CreateGeomBindTransformAttr(matrix(SHAPE))
+    binding.CreateJointIndicesPrimvar(False, 2).Set([0, 1] * len(ROD.vertices))
+    binding.CreateJointWeightsPrimvar(False, 2).Set(np.stack([1 - SHARE, SHARE], axis=1).ravel().tolist())
+    if is_instance:
+        prim = stage.DefinePrim("/rod")
+        prim.GetReferences().AddInternalReference(place)
+        prim.SetInstanceable(True)
+    stage.Save()
+    (shape,) = read_usd(path).visuals
+    expected = bent(SHAPE)
+    np.testing.assert_allclose(shape.surface.vertices, expected.vertices, atol=1e-6)
+    asset = listed(tmp_path, "it.usda", path.read_text(), ", decomposition: convex, mass: 2")
+    np.testing.assert_allclose(asset.inertia, expected.moment_inertia * (2 / expected.volume), rtol=1e-4, atol=1e-7)
+
+
+def test_skins_of_other_notations_are_the_same(tmp_path: Path) -> None:
+    """Two sets of influences, whose weights then add up to 2, and joints by id."""
+    pytest.importorskip("collada")
+    expected = bent(np.eye(4)).vertices @ Y_UP.T
+    file = json.loads(skinned_gltf("gltf"))
+    attributes = file["meshes"][0]["primitives"][0]["attributes"]
+    attributes |= {"JOINTS_1": attributes["JOINTS_0"], "WEIGHTS_1": attributes["WEIGHTS_0"]}
+    (tmp_path / "it.gltf").write_text(json.dumps(file))
+    np.testing.assert_allclose(read_mesh(tmp_path / "it.gltf")[0].vertices, expected, atol=1e-6)
+    plain, found = skinned_dae(), []
+    ids = plain.replace("Name_array", "IDREF_array").replace(">a b<", ">a n2<")
+    for text in (plain, ids.replace('<node\nsid="b"', '<node id="n2" sid="c"')):
+        assert text == plain or "n2" in text.partition("<library_visual")[2]
+        (tmp_path / "it.dae").write_text(text)
+        found.append(read_mesh(tmp_path / "it.dae")[0].vertices)
+    np.testing.assert_array_equal(*found)
+
+
+def test_a_corner_without_a_joint_keeps_its_bind_shape_and_morphs_are_named(tmp_path: Path) -> None:
+    pytest.importorskip("collada")
+    text = re.sub(r"<v>.*</v>", lambda match: match[0].replace("0 ", "-1 ", 1), skinned_dae())
+    (tmp_path / "it.dae").write_text(text)  # -1 is the bind shape: the first corner has all its weight there
+    first = SHARE[0] * trimesh.transform_points(ROD.vertices[:1], FIRST @ SECOND @ BINDS[1] @ SHAPE)
+    first += (1 - SHARE[0]) * trimesh.transform_points(ROD.vertices[:1], SHAPE)
+    assert cKDTree(read_mesh(tmp_path / "it.dae")[0].vertices).query(first)[0][0] < 1e-6
+    sources = """<source id="mt"><IDREF_array id="mta" count="1">g</IDREF_array><technique_common><accessor
+source="#mta" count="1"><param name="MORPH_TARGET" type="IDREF"/></accessor></technique_common></source><source id="mw">
+<float_array id="mwa" count="1">0</float_array><technique_common><accessor source="#mwa" count="1"><param
+name="MORPH_WEIGHT" type="float"/></accessor></technique_common></source>"""
+    targets = '<input semantic="MORPH_TARGET" source="#mt"/><input semantic="MORPH_WEIGHT" source="#mw"/>'
+    morph = f'<morph source="#g">{sources}<targets>{targets}</targets></morph>'
+    more = f'<library_controllers><controller id="k">{morph}</controller></library_controllers>'
+    node = '<instance_controller url="#k"/>'
+    asset = listed(tmp_path, "it.dae", dae(triangles(block()), block().vertices, more=more, node=node))
+    assert sizes(asset) == list(BOX)
+    assert "its morph targets are not applied" in said(tmp_path)
+
+
+def test_what_a_skin_lacks_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("collada")
+    file = json.loads(skinned_gltf("gltf"))
+    (tmp_path / "it.gltf").write_text(json.dumps({**file, "scenes": [{"nodes": [0]}]}))
+    with pytest.raises(CorruptFileError, match=r"the nodes \[1, 2\], joints of a skin, are not in its scene"):
+        read_mesh(tmp_path / "it.gltf")
+    del file["meshes"][0]["primitives"][0]["attributes"]["JOINTS_0"]
+    (tmp_path / "it.gltf").write_text(json.dumps(file))
+    with pytest.raises(InvalidInputError, match="a skin without joints or weights"):
+        read_mesh(tmp_path / "it.gltf")
+    (tmp_path / "it.dae").write_text(skinned_dae().replace(">a b<", ">a c<"))
+    with pytest.raises(CorruptFileError, match="the joint 'c' of the skin 'k' is not in its scene"):
+        read_mesh(tmp_path / "it.dae")
 
 
 # -- polygons -------------------------------------------------------------------------------------
@@ -304,15 +495,70 @@ def test_what_a_gltf_holds_besides_its_geometry_is_named(tmp_path: Path) -> None
         block().faces,
         extensionsUsed=["KHR_texture_transform", "VENDOR_thing", "KHR_materials_unlit"],
         animations=[],
-        nodes=[{"mesh": 0, "skin": 0, "weights": [1.0]}],
-        skins=[],
+        nodes=[{"mesh": 0, "weights": [1.0]}],
         images=[{"uri": "lost.png"}],
     )
     text = said(tmp_path)
-    for name in ("KHR_texture_transform", "VENDOR_thing", "animations", "skins", "morph targets"):
+    for name in ("KHR_texture_transform", "VENDOR_thing", "animations", "morph targets"):
         assert f"its {name} is not applied" in text
     assert "its texture 'lost.png' is not there" in text
     assert "unlit" not in text
+
+
+# -- PLY, OFF, STL --------------------------------------------------------------------------------
+
+CORNERS = "\n".join(" ".join(map(str, row)) for row in block().vertices.tolist())
+FACES = "\n".join(f"3 {a} {b} {c}" for a, b, c in block().faces.tolist())
+
+
+def ply(element: str = "", rows: str = "", comment: str = "") -> str:
+    head = "".join(f"property float {axis}\n" for axis in "xyz")
+    faces = "element face 12\nproperty list uchar int vertex_indices\n"
+    head = f"ply\nformat ascii 1.0\n{comment}element vertex 8\n{head}{faces}{element}end_header"
+    return f"{head}\n{CORNERS}\n{FACES}\n{rows}"
+
+
+def off(kind: str, corner: str = "", face: str = "") -> str:
+    corners, faces = (text.replace("\n", f"{more}\n") + more for text, more in ((CORNERS, corner), (FACES, face)))
+    return f"{kind}OFF\n8 12 0\n{corners}\n{faces}\n"
+
+
+def stl(head: bytes = b"", behind: bytes = bytes(2)) -> bytes:
+    data = bytearray(block().export(file_type="stl"))
+    data[: len(head)] = head
+    data[84 + 48 : 84 + 50] = behind
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("it.ply", ply(), ""),
+        ("it.ply", ply("element tristrips 1\nproperty list int int vertex_indices\n", "3 0 1 2\n"), "'tristrips'"),
+        ("it.ply", ply("element edge 1\nproperty int vertex1\nproperty int vertex2\n", "0 1\n"), "'edge' are left"),
+        ("it.ply", ply(comment="comment TextureFile lost.png\n"), "its texture 'lost.png' is not there"),
+        ("it.off", off(""), ""),
+        ("it.off", off("C", " 255 0 0 255"), "its colours, normals and texture coordinates are not read"),
+        ("it.off", off("N", " 0 0 1"), "its colours, normals and texture coordinates are not read"),
+        ("it.off", off("", "", " 255 0 0"), "its colours, normals and texture coordinates are not read"),
+        ("it.stl", stl(), ""),
+        ("it.stl", stl(b"COLOR=\xff\x00\x00\xff"), "its colours are not read"),
+        ("it.stl", stl(behind=b"\x1f\x80"), "its colours are not read"),
+    ],
+)  # fmt: skip
+def test_what_a_simple_mesh_file_holds_besides_its_triangles_is_named(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, text: str | bytes, words: str
+) -> None:
+    asset = listed(tmp_path, name, text)
+    assert asset.mass == pytest.approx(500 * 0.2 * 0.1 * 0.04)
+    assert words in said(tmp_path)
+    assert words or "not" not in said(tmp_path).partition("%")[0]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_points_of_four_dimensions_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"it\.off is a 4OFF"):
+        listed(tmp_path, "it.off", off("4", " 1"))
 
 
 # -- closed bodies --------------------------------------------------------------------------------
@@ -604,6 +850,9 @@ SCHEMAS = {
     "URDF": """robot: @name @version link joint material transmission gazebo sensor
 link: @name @type inertial visual collision
 joint: @name @type origin parent child axis calibration dynamics limit safety_controller mimic
+axis: @xyz
+limit: @lower @upper @effort @velocity
+dynamics: @damping @friction
 parent: @link
 child: @link
 origin: @xyz @rpy @quat_xyzw
@@ -633,6 +882,10 @@ projector audio_sink audio_source battery light particle_emitter
 joint: @name @type parent child gearbox_ratio gearbox_reference_body thread_pitch screw_thread_pitch axis axis2
 physics pose
 sensor
+axis: initial_position xyz use_parent_model_frame mimic dynamics limit
+xyz: @expressed_in
+limit: lower upper effort velocity stiffness dissipation
+dynamics: damping friction spring_reference spring_stiffness
 frame: @name @attached_to pose
 pose: @relative_to @rotation_format @degrees
 inertial: @auto mass density auto_inertia_params pose inertia fluid_added_mass
@@ -679,7 +932,9 @@ radius="0.1" length="0.3"/></geometry></collision><collision><geometry><capsule 
 </collision><collision><origin quat_xyzw="0 0 1 1"/><geometry><mesh filename="m.stl" scale="1 2
 3"/></geometry></collision>
 </link><link name="b"/><joint name="j" type="fixed"><parent link="a"/><child link="b"/><origin xyz="1 0 0"/></joint>
-</robot>""",
+<link name="c"/><joint name="k" type="revolute"><parent link="a"/><child link="c"/><axis xyz="0 0 1"/><limit lower="-1"
+upper="1"/><dynamics damping="1" friction="2"/></joint><link name="d"/><joint name="l" type="continuous"><parent
+link="a"/><child link="d"/><mimic joint="k"/></joint></robot>""",
     "SDF": """<sdf version="1.11"><world name="w"><model name="r"><static>true</static><frame name="f"
 attached_to="a"><pose>1 0 0
 0 0 0</pose></frame><link name="a"><pose relative_to="" degrees="true">0 0 1 90 0 0</pose><inertial
@@ -704,7 +959,13 @@ name="e"><geometry><sphere><radius>0.3</radius></sphere></geometry></collision><
 <pose relative_to="f">0 0 2 0 0 0</pose><parent>a</parent><child>b</child></joint><frame name="h"
 attached_to="j"/><link
 name="c"><pose relative_to="h"/><visual
-name="p"><geometry><plane/></geometry></visual></link></model></world></sdf>""",
+name="p"><geometry><plane/></geometry></visual></link><joint name="k" type="revolute"><pose>0 0 0 0.1 0
+0</pose><parent>a</parent><child>c</child><axis><xyz expressed_in="f">0 0 1</xyz><limit><lower>-1</lower>
+<upper>1</upper></limit><dynamics><damping>1</damping><friction>2</friction></dynamics></axis></joint><link
+name="d"/><joint name="l" type="revolute">
+<pose>0 0 0 0.1 0 0</pose><parent>a</parent><child>d</child><axis><use_parent_model_frame>true</use_parent_model_frame>
+</axis></joint><link name="e"/><joint name="m" type="revolute"><parent>a</parent><child>e</child><axis>
+<mimic joint="k"/></axis></joint></model></world></sdf>""",
 }
 """A file with all that is read."""
 
@@ -744,20 +1005,22 @@ def summary(model: Model) -> tuple[Any, ...]:
     shapes = [
         (s.kind, s.size, s.pose.tobytes(), s.color, s.is_convex, s.part) for s in model.visuals + model.collisions
     ]
-    inertials = [(i.mass, i.center_of_mass.tobytes(), i.inertia.tobytes()) for i in model.inertials]
-    return shapes, inertials, model.static, model.notes
+    inertials = [(i.mass, i.center_of_mass.tobytes(), i.inertia.tobytes()) for _, i in model.inertials]
+    joints = [(*vars(joint).values(), joint.pose.tobytes(), joint.axis.tobytes()) for joint in model.joints]
+    plain = [tuple(value for value in row if not isinstance(value, np.ndarray)) for row in joints]
+    return shapes, inertials, model.static, model.notes, plain, model.faults
 
 
 @pytest.mark.parametrize("kind", ["URDF", "SDF"])
 def test_each_value_that_is_said_to_be_read_matters(tmp_path: Path, kind: str) -> None:
     """Another value, or nonsense, gives another model or an error; so does a second of what may be there once."""
-    expected = summary(read(tmp_path, kind, ElementTree.fromstring(FULL[kind])))
-    assert not unread(read(tmp_path, kind, ElementTree.fromstring(FULL[kind])))
     covered = set()
-    count = len(list(ElementTree.fromstring(FULL[kind]).iter()))
-    for index in range(count):
-        for key in (None, *list(ElementTree.fromstring(FULL[kind]).iter())[index].attrib):
-            root = ElementTree.fromstring(FULL[kind])
+    full = FULL[kind], FULL[kind].replace("<static>true</static>", "")  # the joints of a static model are frozen
+    for text, index in [(t, i) for t in full for i in range(len(list(ElementTree.fromstring(t).iter())))]:
+        expected = summary(read(tmp_path, kind, ElementTree.fromstring(text)))
+        assert not unread(read(tmp_path, kind, ElementTree.fromstring(text)))
+        for key in (None, *list(ElementTree.fromstring(text).iter())[index].attrib):
+            root = ElementTree.fromstring(text)
             element = list(root.iter())[index]
             name = f"@{key}" if key else ""
             if key is None and (len(element) or not (element.text or "").strip()):

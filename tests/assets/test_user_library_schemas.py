@@ -7,13 +7,16 @@ import copy
 import json
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
 from scene_envs.assets.importing.build import AssetEntry, build_asset
+from scene_envs.assets.importing.mesh_files import FORMATS
 from scene_envs.assets.importing.robot_files import read_usd
 from scene_envs.errors import InvalidInputError, SceneEnvsError
 from tests.helpers.model_files import POINTS, block, dae, gltf, triangles
@@ -35,8 +38,8 @@ def outcome(path: Path) -> tuple[Any, ...] | str:
     look = asset.visual
     return (
         asset.mass, asset.center_of_mass.tobytes(), asset.inertia.tobytes(), asset.static, look.vertices.tobytes(),
-        look.visual.vertex_colors.tobytes(), [part.vertices.tobytes() for part in asset.fine],
-        report.notes + report.warnings,
+        look.faces.tobytes(), look.visual.vertex_colors.tobytes(), [part.vertices.tobytes() for part in asset.fine],
+        report.origin, report.notes + report.warnings,
     )  # fmt: skip
 
 
@@ -137,7 +140,7 @@ GLTF: dict[str, dict[str, Any]] = {  # the properties of glTF 2.0 and a value th
 }  # fmt: skip
 UNSEEN = {
     "names": "name extras",
-    "nothing refers to it": ":cameras :textures :samplers",
+    "nothing refers to it": ":cameras :textures :samplers :skins",
     "normals follow from triangles, and looks name second texture coordinates": "NORMAL TANGENT TEXCOORD_1",
     "a skin that nothing applies": "JOINTS_0 WEIGHTS_0",
     "morph targets at rest": "targets",
@@ -286,47 +289,191 @@ def test_each_shape_of_usd_is_read_or_named_or_refused(tmp_path: Path) -> None:
     assert sorted(kept) == ["Capsule", "Cube", "Cylinder", "Sphere"]
 
 
+USD_SHAPES: dict[str, dict[str, Any]] = {
+    "Cube": {"size": 0.3}, "Sphere": {"radius": 0.3}, "Cylinder": {"radius": 0.3, "height": 0.5, "axis": "X"},
+    "Capsule": {"radius": 0.3, "height": 0.5, "axis": "X"},
+    "Mesh": {"points": (2 * block().vertices).tolist(), "faceVertexCounts": [4, 4] + [3] * 8, "holeIndices": [0],
+             "faceVertexIndices": block().faces[::-1].ravel().tolist(), "orientation": "leftHanded",
+             "subdivisionScheme": "loop"},
+}  # fmt: skip
+USD_GPRIM = {
+    "visibility": "invisible", "purpose": "guide", "primvars:displayColor": [(1, 0, 0)], "orientation": "rightHanded"
+}  # fmt: skip
+USD_UNSEEN = {
+    "pictures are of closed bodies in one opaque colour, with normals of their own": "doubleSided normals "
+    "primvars:displayOpacity",
+    "they follow from the points": "extent velocities accelerations",
+    "where nothing is subdivided": "cornerIndices cornerSharpnesses creaseIndices creaseLengths creaseSharpnesses "
+    "interpolateBoundary faceVaryingLinearInterpolation triangleSubdivisionRule",
+    "of programs": "proxyPrim xformOpOrder",
+}
+
+
+@pytest.mark.parametrize("kind", USD_SHAPES)
+def test_each_attribute_of_the_shapes_of_usd(tmp_path: Path, kind: str) -> None:
+    """At time 0: a value that is only known over time counts as well. A primitive has no orientation."""
+    pytest.importorskip("pxr")
+    from pxr import Sdf, Usd, UsdGeom
+
+    changed: dict[str, Path] = {}
+    for name in ("", *Usd.SchemaRegistry().FindConcretePrimDefinition(kind).GetPropertyNames()):
+        if name in " ".join(USD_UNSEEN.values()).split():
+            continue
+        changed[name] = tmp_path / f"it_{name.replace(':', '_')}.usda"
+        stage = Usd.Stage.CreateNew(str(changed[name]))
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+        UsdGeom.Cube.Define(stage, "/other").AddTranslateOp().Set((0, 0, 3))
+        prim = stage.DefinePrim("/it", kind)
+        if kind == "Mesh":
+            for key, values in (("points", block().vertices), ("faceVertexIndices", block().faces.ravel())):
+                prim.GetAttribute(key).Set(values.tolist())
+            prim.GetAttribute("faceVertexCounts").Set([3] * 12)
+        if name:
+            attribute = prim.GetAttribute(name)
+            attribute.Clear()
+            when = [] if attribute.GetVariability() == Sdf.VariabilityUniform else [4.0]
+            attribute.Set({**USD_GPRIM, **USD_SHAPES[kind]}[name], *when)
+        stage.Save()
+    expected = changed.pop("")
+    assert silent(expected, changed) == ({"orientation"} if kind != "Mesh" else set())
+
+
 # -- MJCF -----------------------------------------------------------------------------------------
 
 mujoco = pytest.importorskip("mujoco")
-NAMED = {  # elements of which the report speaks, and a model that has them
-    "texture": '<asset><texture name="t" type="2d" builtin="flat" width="8" height="8"/></asset>',
-    "motor": '<actuator><motor joint="j"/></actuator>',
-    "jointpos": '<sensor><jointpos joint="j"/></sensor>',
-    "fixed": '<tendon><fixed><joint joint="j" coef="1"/></fixed></tendon>',
-    "equality": '<equality><joint joint1="j"/></equality>',
-    "plugin": '<extension><plugin plugin="mujoco.pid"><instance name="p"/></plugin></extension>',
+WEDGE = "0 0 0 .1 0 0 0 .1 0 0 0 .1 .1 .1 0"
+MJCF = f"""<mujoco><compiler/><default><geom size=".02 .02 .02"/><mesh/><material/><joint/><default class="c">
+<geom density="300"/><mesh scale="2 1 1"/><material rgba="0 1 0 1"/></default></default><asset>
+<texture name="t" type="2d" builtin="flat" width="8" height="8"/><mesh name="m" vertex="{WEDGE}"/>
+<mesh name="n" vertex="{WEDGE}" scale="1 3 1"/><material name="red"/></asset><worldbody><body name="b">
+<freejoint/><geom type="box" size=".1 .05 .02"/><frame><geom type="mesh" mesh="m" pos="0 0 .2" material="red"/></frame>
+<geom type="box" size=".01 .02 .03" pos="-.2 0 0" group="1"/><body name="d" pos="0 0 .1"><inertial pos="0 0 0" mass="1"
+diaginertia="1e-3 1.2e-3 1.5e-3"/><joint name="j" axis="0 1 0" pos="0 .01 0"/></body><body><geom pos="0 .1 0"/></body>
+</body></worldbody></mujoco>"""
+TURNS = {"axisangle": "0 0 1 30", "euler": "20 0 30", "quat": ".9 .4 0 0", "xyaxes": "1 1 0 -1 1 0", "zaxis": "1 0 1"}
+VALUES: dict[str, dict[str, str]] = {
+    "compiler": {
+        "alignfree": "true", "angle": "radian", "autolimits": "false", "balanceinertia": "true", "boundmass": "2",
+        "boundinertia": "1e-2", "discardvisual": "true", "eulerseq": "zyx", "fitaabb": "true", "fusestatic": "true",
+        "inertiafromgeom": "true", "inertiagrouprange": "0 1", "settotalmass": "3", "strippath": "true",
+    },
+    "mesh": {
+        "class": "c", "face": "0 2 1 0 1 3 0 3 2 1 2 4 1 4 3 2 3 4", "inertia": "shell", "maxhullvert": "4",
+        "refpos": "0 0 1", "refquat": ".9 .4 0 0", "scale": "1 2 1", "vertex": WEDGE + " 0 0 -.1", "material": "red",
+        "smoothnormal": "true", "normal": " ".join(["0 0 1"] * 5), "texcoord": " ".join(["0 0"] * 5),
+        "builtin": "sphere", "params": "2",
+    },
+    "material": {
+        "class": "c", "rgba": "0 0 1 1", "texture": "t", "emission": "1", "metallic": "1", "reflectance": ".5",
+        "roughness": ".1", "shininess": ".1", "specular": ".1", "texrepeat": "2 2", "texuniform": "true",
+    },
+    "body": TURNS | {
+        "childclass": "c", "gravcomp": "1", "pos": "1 2 3", "sleep": "never", "simple": "true", "fuse": "true",
+        "user": "1",
+    },
+    "inertial": TURNS | {
+        "diaginertia": "2e-3 2e-3 2e-3", "fullinertia": "2e-3 2e-3 2e-3 1e-4 0 0", "mass": "2", "pos": "0 .01 0",
+    },
+    "freejoint": {"group": "1", "align": "true"},
+    "joint": {
+        "actuatorfrclimited": "true", "actuatorfrcrange": "-1 1", "actuatorgravcomp": "true", "armature": ".1",
+        "axis": "1 0 0", "class": "c", "damping": "1", "frictionloss": "1", "group": "1", "limited": "true", "margin":
+        ".1", "pos": "0 .2 0", "range": "-1 1", "ref": "40", "solimpfriction": ".8 .9 .01", "solimplimit":
+        ".8 .9 .01", "type": "slide", "solreffriction": ".01 1", "solreflimit": ".01 1", "springdamper": "1 1",
+        "springref": "1", "springyield": "1", "stiffness": "1", "user": "1",
+    },
+    "geom": TURNS | {
+        "adhesion": "1", "castshadow": "false", "class": "c", "condim": "4", "conaffinity": "2", "contype": "2",
+        "density": "300", "fitscale": "2", "fluidcoef": "1 1 1 1 1", "fluidshape": "ellipsoid", "friction": ".5",
+        "fromto": "0 0 0 0 0 .3", "gap": ".01", "group": "3", "margin": ".01", "mass": "2", "material": "red",
+        "mesh": "n", "pos": "0 0 .3", "priority": "1", "rgba": "0 0 1 1", "shellinertia": "true", "size": ".2 .2 .2",
+        "solimp": ".8 .9 .01", "solmix": "2", "solref": ".01 1", "surfacevel": "1", "type": "cylinder", "user": "1",
+    },
+}  # fmt: skip
+"""Attributes of the elements that make a body, with a value that says something."""
+WITH: dict[str, dict[str, str]] = {  # other attributes of an element, without which one says nothing
+    "geom/mesh": {"type": "mesh"}, "geom/fitscale": {"mesh": "n"}, "mesh/params": {"builtin": "sphere"},
+    "geom/fromto": {"type": "capsule", "size": ".1"}, "mesh/builtin": {"params": "2"},
+}  # fmt: skip
+HELD = {  # elements that the report names, with what has one, as a child of the root element or inside the first body
+    "material/layer": '<asset><material name="l"><layer role="rgb" texture="t"/></material></asset>',
+    "mujoco/actuator": '<actuator><motor joint="j"/></actuator>',
+    "mujoco/sensor": '<sensor><jointpos joint="j"/></sensor>',
+    "mujoco/tendon": '<tendon><fixed><joint joint="j" coef="1"/></fixed></tendon>',
+    "mujoco/equality": '<equality><joint joint1="j"/></equality>',
+    "mujoco/contact": '<contact><exclude body1="b" body2="d"/></contact>',
+    "mujoco/keyframe": '<keyframe><key time="1"/></keyframe>',
+    "mujoco/extension": '<extension><plugin plugin="mujoco.pid"><instance name="p"/></plugin></extension>',
+    "mujoco/deformable": '<deformable><flex name="f" dim="1" body="b d" element="0 1" radius=".1"/></deformable>',
+    "asset/hfield": '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>',
+    "asset/texture": '<asset><texture name="u" type="2d" builtin="flat" width="8" height="8"/></asset>',
 }
-BODY = 'gravcomp="1"'
-COMPILED = {
-    "MuJoCo compiles them into what is read": "compiler default asset mesh material "
-    "layer hfield model worldbody (world)body frame replicate composite inertial joint freejoint geom attach "
-    "lengthrange mujoco element config instance extension",
-    "of a simulation, not of a body": "option flag size statistic visual global quality headlight map scale rgba "
-    "custom numeric text tuple keyframe key contact pair exclude site camera light deformable",
-    "they are counted in the report": "actuator sensor tendon equality flex flexcomp skin bone edge elasticity pin "
-    "spatial pulley fixed connect weld flexstrain texture plugin",
+UNSAID = {
+    "names": "name content_type",
+    "files, in tests of their own": "file assetdir meshdir texturedir",
+    "of MuJoCo's own writer": "conflict coordinate passthrough savecanonical savecompiled saveinertial usethread",
+    "of bodies on the world, and of heights": "mocap hfield",
 }
+EXPANDED = "attach composite flexcomp replicate lengthrange model"
+"""Elements that MuJoCo turns into others before anything is read."""
 
 
-def mjcf(root: str, body: str = "") -> str:
-    return f"""<mujoco><worldbody><body name="b" {body}><geom type="box" size="0.1 0.05 0.02"/>
-<body pos="0 0 0.1"><joint name="j" type="hinge"/><geom type="sphere" size="0.02"/></body></body></worldbody>{root}
-</mujoco>"""
+def mjcf_schema() -> list[tuple[list[str], list[str]]]:
+    """The elements, each after those that hold it, and their attributes."""
+    found: list[tuple[list[str], list[str]]] = []
+    for line in mujoco.mj_printSchema(False, False).splitlines():
+        if match := re.match(r"( *)(\S+) \(.\)", line):
+            above = found[-1][0][: len(match[1]) // 3] if found else []
+            found.append(([*above, match[2].replace("(world)", "")], []))
+        found[-1][1].extend(line[match.end() if match else 0 :].split())
+    return found
 
 
-def test_each_element_of_mjcf(tmp_path: Path) -> None:
-    """Elements below actuator and sensor are kinds of these."""
-    plain = tmp_path / "it.xml"
-    plain.write_text(mjcf(""))
-    changed = {}
-    for name, text in {**{name: mjcf(text) for name, text in NAMED.items()}, "gravcomp": mjcf("", BODY)}.items():
-        changed[name] = tmp_path / f"{name}.xml"
-        changed[name].write_text(text)
-    assert silent(plain, changed) == set()
-    lines = [line.split() for line in mujoco.mj_printSchema(False, False).splitlines()]
-    rows = [line for line in lines if len(line) > 1 and len(line[1]) == 3 and line[1][0] == "("]
-    start = {name: [row[0] for row in rows].index(name) for name in ("actuator", "sensor", "keyframe")}
-    kinds = {row[0] for row in rows[start["actuator"] : start["keyframe"]]}
-    known = set(" ".join(COMPILED.values()).split())
-    assert sorted({row[0] for row in rows} - kinds - known) == []
+def weighed(path: Path) -> list[float]:
+    """Mass, centre of mass and inertia in the frame of the root body, by MuJoCo's own composite inertia."""
+    model: Any = mujoco.MjModel.from_xml_path(str(path))
+    data: Any = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    turn, (xx, yy, zz, xy, xz, yz) = data.xmat[1].reshape(3, 3), data.crb[1][:6]
+    inertia = turn.T @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn
+    return [data.crb[1][9], *((data.subtree_com[1] - data.xpos[1]) @ turn), *inertia.ravel()]
+
+
+def test_each_attribute_of_mjcf(tmp_path: Path) -> None:
+    """What changes the compiled body is as MuJoCo weighs it; the rest is named, or left out for a reason."""
+    (tmp_path / "it.xml").write_text(MJCF)
+    changed = {name: MJCF.replace("</mujoco>", f"{text}</mujoco>") for name, text in HELD.items()}
+    read, left_out = FORMATS["MJCF"]["read"], set(" ".join(FORMATS["MJCF"]["left out"].values()).split())
+    unsaid = " ".join(UNSAID.values()).split()
+    for path, names in mjcf_schema():
+        edges = [f"{above}/{tag}" for above, tag in pairwise(path)]
+        if left_out & {*edges} or {*path} & {*EXPANDED.split()}:
+            continue
+        unread = [edge for edge in edges if edge.partition("/")[2] not in read and "compiler" not in edge]
+        assert {*unread[:1]} <= {*HELD} or re.search("default/|plugin|skin", unread[0]), path
+        for name in names if not unread and path[-1] in VALUES else ():
+            if name in unsaid:
+                continue
+            root, place = ElementTree.fromstring(MJCF), f"{path[-1]}/{name}"
+            inside = root.find("default" if "default" in path else "asset" if "asset" in path else "worldbody")
+            element = (
+                root.find("compiler") if path[-1] == "compiler" else [*inside.iter(path[-1])][-(path[-1] == "body")]
+            )
+            for key, value in {**WITH.get(place, {}), name: VALUES[path[-1]][name]}.items():
+                element.set(key, value)
+            changed["/".join([*path, name])] = ElementTree.tostring(root, "unicode")
+    expected, silent, wrong = outcome(tmp_path / "it.xml"), set(), {}
+    for name, text in changed.items():
+        path = tmp_path / "changed.xml"
+        path.write_text(text)
+        found = outcome(path)
+        if found == expected:
+            silent.add(name)
+        elif not isinstance(found, str):
+            center, inertia = np.frombuffer(found[1]) - found[-2], np.frombuffer(found[2])
+            agrees = np.allclose([found[0], *center, *inertia], weighed(path), rtol=1e-6, atol=1e-9)
+            impossible = re.search("shell|mesh/inertia|boundinertia", name) and "recomputed" in str(found[-1])
+            wrong |= {} if agrees or impossible else {name: found[-1]}
+    assert sorted(name for name in silent if "/@".join(name.rsplit("/", 2)[1:]) not in left_out) == []
+    assert wrong == {}

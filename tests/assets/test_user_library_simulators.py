@@ -92,7 +92,7 @@ def test_a_cabinet_is_one_body_as_mujoco_weighs_it(tmp_path: Path) -> None:
     for words in (
         "movable joints frozen at zero: hinge",
         "'floor', a plane of body 'world', is left out",
-        "friction of",
+        "not read: geom/@friction",
     ):
         assert words in said(tmp_path)
     fixed = listed(tmp_path, "it.xml", CABINET.replace("<freejoint/>", ""))
@@ -221,6 +221,31 @@ def test_a_file_that_mujoco_wrote_is_read(tmp_path: Path) -> None:
     assert asset.mass == pytest.approx(500 * 8)
 
 
+def test_colours_of_usd_come_by_index_and_from_above_and_those_of_parts_are_named(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Sdf, Usd, UsdGeom
+
+    stage = Usd.Stage.CreateNew(str(tmp_path / "it.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    above = UsdGeom.PrimvarsAPI(UsdGeom.Xform.Define(stage, "/a"))
+    above.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, "constant").Set([(0, 1, 0)])
+    meshes = [UsdGeom.Mesh.Define(stage, f"/a/{name}") for name in "mno"]
+    for index, mesh in enumerate(meshes):
+        mesh.CreatePointsAttr((trimesh.creation.box((0.1, 0.1, 0.1)).vertices + np.array([index, 0, 0])).tolist())
+        mesh.CreateFaceVertexCountsAttr([3] * 12)
+        mesh.CreateFaceVertexIndicesAttr(trimesh.creation.box().faces.ravel().tolist())
+    own = meshes[0].CreateDisplayColorPrimvar("uniform")
+    own.Set([(1, 0, 0), (0, 0, 1)])
+    own.SetIndices([0, 0, 0, *[1] * 9])
+    UsdGeom.Subset.CreateGeomSubset(meshes[1], "half", "face", [0, 1], "materialBind")
+    stage.Save()
+    asset = listed(tmp_path, "it.usda")
+    counts = dict(zip(*np.unique(asset.visual.visual.face_colors @ [1, 2, 4, 0], return_counts=True), strict=True))
+    assert counts == {255: 3, 4 * 255: 9, 2 * 255: 24}
+    assert "not read: materials of parts of /a/n" in said(tmp_path)
+
+
 def test_colours_of_faces_and_a_left_handed_mirrored_mesh(tmp_path: Path) -> None:
     """USD keeps linear colours: 0.2159 is 128 of 255 in sRGB. Faces of a mirror face outward again."""
     pytest.importorskip("pxr")
@@ -308,10 +333,43 @@ def test_a_folder_leaves_out_what_an_mjcf_includes(tmp_path: Path) -> None:
     body = "<body><freejoint/><geom type='mesh' mesh='b'/></body>"
     head = "<compiler assetdir='assets'/><include file='parts/inc.xml'/>"
     (tmp_path / "cup.xml").write_text(f"<mujoco>{head}<worldbody>{body}</worldbody></mujoco>")
-    (tmp_path / "parts" / "inc.xml").write_text("<mujoco><asset><mesh file='b.stl'/></asset></mujoco>")
+    (tmp_path / "parts" / "inc.xml").write_text("<mujoco><include file='parts/more.xml'/></mujoco>")
+    (tmp_path / "parts" / "more.xml").write_text("<mujoco><asset><mesh file='b.stl'/></asset></mujoco>")
     (asset,) = load_library(tmp_path)
     assert asset.name == "cup"
     assert asset.mass == pytest.approx(1000 * 0.2 * 0.1 * 0.05)
+
+
+def test_a_model_that_another_attaches_is_no_asset_and_joins_its_mass(tmp_path: Path) -> None:
+    """By MuJoCo, which also strips the folders of its meshes."""
+    trimesh.creation.box((0.2, 0.1, 0.05)).export(tmp_path / "b.stl")
+    part = "<worldbody><body name='x'><geom type='mesh' mesh='b'/></body></worldbody>"
+    (tmp_path / "lid.xml").write_text(f"<mujoco><asset><mesh file='far/b.stl'/></asset>{part}</mujoco>")
+    body = "<freejoint/><geom type='box' size='.1 .1 .1'/><attach model='lid' body='x' prefix='p'/>"
+    asset = "<compiler strippath='true'/><asset><model name='lid' file='lid.xml'/></asset>"
+    (tmp_path / "cup.xml").write_text(f"<mujoco>{asset}<worldbody><body>{body}</body></worldbody></mujoco>")
+    (cup,) = load_library(tmp_path)
+    assert cup.name == "cup"
+    assert cup.mass == pytest.approx(1000 * (0.2**3 + 0.2 * 0.1 * 0.05))
+
+
+def test_textures_of_mjcf_are_not_opened(tmp_path: Path) -> None:
+    """They are not read, so one that is lost costs nothing."""
+    sides = " ".join(f"file{side}='lost.png'" for side in ("right", "left", "up", "down", "front", "back"))
+    textures = f"<texture name='t' type='2d' file='lost.png'/><texture type='skybox' {sides}/>"
+    head = f"<mujoco><asset>{textures}<material name='m' texture='t'/></asset><worldbody><body><freejoint/>"
+    geom = "<geom type='box' size='.1 .1 .1' material='m'/>"
+    asset = listed(tmp_path, "it.xml", f"{head}{geom}</body></worldbody></mujoco>")
+    assert asset.mass == pytest.approx(8)
+    assert "not read: asset/texture (2 times), material/@texture" in said(tmp_path)
+
+
+def test_drag_of_a_free_joint_and_masks_of_geoms_are_named(tmp_path: Path) -> None:
+    geom = "<geom type='box' size='.1 .1 .1' contype='4' conaffinity='2'/>"
+    head = "<mujoco><default><joint damping='1'/></default><worldbody><body><joint type='free' frictionloss='1'/>"
+    listed(tmp_path, "it.xml", f"{head}{geom}</body></worldbody></mujoco>")
+    for words in ("damping of the free joint", "frictionloss of the free joint", "contype and conaffinity above 1"):
+        assert words in said(tmp_path)
 
 
 def test_a_face_beyond_the_vertices_is_named(tmp_path: Path) -> None:

@@ -67,6 +67,8 @@ def test_help_loads_nothing_heavy():
     code = (
         "import sys; from agents.cli import main\n"
         f"for command in {list(COMMANDS)}: main([command, '--help'])\n"
+        "main(['post-train', 'reward=clutter', 'algorithm=nft', 'prior=dimsum_table', '--help'])\n"
+        "main(['search', 'planner=mcts', 'mask=culprits', 'prompt=a cup', 'count=3', '--help'])\n"
         "print({'torch', 'hydra', 'matplotlib', 'pybullet'} & set(sys.modules), file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -246,7 +248,8 @@ def test_text_that_looks_like_an_interpolation_is_text(text, echo, tmp_path):
         (["sample", "device=banana"], "device='banana' is no torch device"),
         (["view", "scene=1e999"], "is neither a name nor a mapping"),
         (["project", "scenes=" + "a" * 300], "no scene file, run or dataset is there"),
-        (["sample", "reward=./mine.py:few"], "add --allow-local if you trust it"),
+        (["sample", "reward=./mine.py:few"], "reward=: there is no file"),
+        (["sample", f"reward={__file__}:few"], "add --allow-local if you trust it"),
     ],
 )
 def test_values_that_no_key_expects_are_refused_in_a_few_words(words, message, capsys, tmp_path):
@@ -337,6 +340,24 @@ LINES = {
     "check-reward scene=dimsum_tabel": "did you mean 'dimsum_table'",
     "priors prior=dimsum_tabel": "did you mean 'dimsum_table'",
 }
+REWARDS = {
+    "{name:clip,reward:clutter,high:x}": "clip: high='x' must be a finite number, or null",
+    "{name:clip,reward:clutter,high:nan}": "clip: high=nan must be a finite number, or null",
+    "{name:clip,reward:clutter,high:inf}": "clip: high=inf must be a finite number, or null",
+    "{name:weighted_sum,rewards:[clutter],weights:[x]}": "weighted_sum: weights='x' must be a finite number",
+    "{name:weighted_sum,rewards:[clutter],weights:[nan]}": "weighted_sum: weights=nan must be a finite number",
+    "{name:weighted_sum,rewards:[clutter],weights:3}": "'weights': 3}: 'int' object is not iterable; its settings are",
+    "{name:weighted_sum,rewards:[clutter],offset:x}": "weighted_sum: offset='x' must be a finite number",
+    "{name:product,rewards:3}": "made with {'rewards': 3}: object of type 'int' has no len(); its settings are",
+    "{name:reachability,opening:x}": "reachability: opening='x' must be a positive number",
+    "{name:reachability,sides:3}": "made with {'sides': 3}: 'int' object is not iterable; its settings are",
+    "{name:category_count,assets:3}": "made with {'assets': 3}: 'int' object is not iterable; its settings are",
+    "{name:prompt_match,prompt:3}": "prompt_match: prompt=3 is not a text or null",
+    "{name:[clip]}": "reward=['clip'] is neither a name",
+    "{name:[clip],high:3}": "a reward mapping needs 'name' (or '_target_'), a text, got {'name': ['clip'], 'high': 3}",
+    "{name:clip}": "missing 1 required positional argument: 'reward'; its settings are",
+    "./nowhere.py:few": "reward=: there is no file",
+}
 WRONG_KEYS = {
     "post-train iterations=a": "iterations=a is not a whole number",
     "sample count=x": "count=x is not a whole number",
@@ -358,6 +379,19 @@ def test_names_paths_and_numbers_are_refused_without_torch():
     assert done.returncode == 0, done.stderr
     for line, told in zip((WRONG_KEYS | LINES).values(), done.stderr.splitlines(), strict=True):
         assert line in told
+
+
+@pytest.mark.parametrize(("reward", "message"), REWARDS.items())
+def test_settings_of_rewards_of_a_wrong_type_are_named(reward, message, capsys):
+    assert main(["check-reward", f"reward={reward}", "scene=dimsum_table", "--allow-local"]) == 2
+    err = capsys.readouterr().err
+    assert message in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_no_dataset_is_named(tmp_path, capsys):
+    assert main(["pretrain", "data=", f"output={tmp_path}"]) == 2
+    assert "data= names no dataset; scene-envs generate makes one" in capsys.readouterr().err
 
 
 def test_the_names_that_are_known_without_torch_are_those_of_the_packages():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import dataclasses
 import itertools
 import re
@@ -18,7 +19,14 @@ from agents.cli import main
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import compose, help_text, keys_of
 from agents.cli.main import expand_sweeps
-from agents.configuration.composition import changed, config_text, dotted_values, field_options
+from agents.configuration.composition import (
+    changed,
+    check_same_keys,
+    config_text,
+    dotted_values,
+    field_options,
+    plain_tree,
+)
 from agents.planning import list_planners
 from agents.planning.ledger import planner_settings
 from agents.post_training.settings import algorithm_settings, list_algorithms
@@ -142,8 +150,10 @@ def test_a_recipe_is_the_same_in_python(kind: Any, recipe: str) -> None:
 
 
 @pytest.mark.slow
-def test_every_option_of_a_group_composes() -> None:
-    """Each option with one command at least, and each group of a command with one option at least."""
+def test_every_option_of_a_group_composes(tmp_path: Path) -> None:
+    """Each option with one command at least, and each group of a command with one option at least; registered options
+    have the values that Hydra composes, as it does where there is a folder of the user's.
+    """
     seen: set[tuple[str, str]] = set()
     for command in SMALLEST_FIRST:
         columns = []
@@ -156,7 +166,9 @@ def test_every_option_of_a_group_composes() -> None:
                 seen |= {(folder, option) for option in options}
         for words in itertools.zip_longest(*columns):  # an option of every group at once
             given = [word for word in words if word]
-            assert isinstance(compose(command, CONFIGS[command], given), CONFIGS[command])
+            made = compose(command, CONFIGS[command], given)
+            assert isinstance(made, CONFIGS[command])
+            assert made == compose(command, CONFIGS[command], given, config_dir=str(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -179,6 +191,24 @@ def test_every_option_of_a_group_composes() -> None:
 def test_wrong_values_in_python_are_named(make: Any, message: str) -> None:
     with pytest.raises((InvalidInputError, UnknownNameError), match=message):
         make()
+
+
+def test_keys_of_one_config_alone_refuse_no_resume() -> None:
+    """Another version may have another key; a setting of a reward is no key."""
+    now = plain_tree(PostTrainConfig(reward={"name": "clip", "high": 3}))
+    before = copy.deepcopy(now)
+    before["old"], before["guard"]["old"], before["guard"]["limits"]["old"] = 1, 2, 3
+    del before["seed"], before["algorithm"]["credit"], before["guard"]["limits"]["stack"]
+    check_same_keys(Path("x"), before, now, (), PostTrainConfig)
+    check_same_keys(Path("x"), now, before, (), PostTrainConfig)
+    for key, value, message in [
+        ("guard", {"limits": {"count": 9}}, r"\(guard.limits.count was 9, is None\)"),
+        ("algorithm", {"name": "nft"}, r"\(algorithm.name was 'nft', is 'ddpo_sf'\)"),
+        ("reward", {"name": "clip"}, r"\(reward.high was None, is 3\)"),
+    ]:
+        with pytest.raises(InvalidInputError, match=message):
+            check_same_keys(Path("x"), {**before, key: value}, now, (), PostTrainConfig)
+    check_same_keys(Path("x"), {**before, "algorithm": {"name": "nft"}}, now, ("algorithm",), PostTrainConfig)
 
 
 def test_numbers_of_numpy_are_numbers() -> None:
@@ -208,9 +238,69 @@ def test_words_win_over_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "words", "expected"),
+    [
+        ("algorithm: nft", [], {"name": "nft", "beta": 0.5}),
+        ("algorithm: nft", ["algorithm.beta=0.3"], {"name": "nft", "beta": 0.3}),
+        ("algorithm: {name: nft, beta: 0.2}", ["algorithm.draws=3"], {"name": "nft", "beta": 0.2, "draws": 3}),
+        ("algorithm: {name: nft, beta: 0.2}", ["algorithm={name: ddpo_sf}"], {"name": "ddpo_sf", "gradient_steps": 8}),
+        ("algorithm: {name: nft, beta: 0.2}", ["algorithm.name=ddpo_sf"], {"name": "ddpo_sf", "gradient_steps": 8}),
+        ("algorithm: {name: ddpo_sf, min_std: 0.2}", ["algorithm=nft"], {"name": "nft", "beta": 0.5}),
+    ],
+)
+def test_a_component_of_a_file_keeps_its_name_or_gives_way_to_another(
+    text: str, words: list[str], expected: dict[str, Any], tmp_path: Path
+) -> None:
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "config.yaml").write_text(text)
+    (tmp_path / "experiment" / "named.yaml").write_text(f"# @package _global_\n{text}\n")
+    found = [
+        compose("post-train", PostTrainConfig, words, config_file=str(tmp_path / "config.yaml")),
+        compose("post-train", PostTrainConfig, ["+experiment=named", *words], config_dir=str(tmp_path)),
+        changed(compose("x", PostTrainConfig, ["algorithm=ddpo_is"]), {"algorithm": expected}),
+    ]
+    for settings in found:
+        assert expected.items() <= vars(settings.algorithm).items()
+    assert found[0] == found[1]
+    assert found[0].algorithm == found[2].algorithm
+
+
+def test_an_algorithm_beside_a_recipe_takes_nothing_of_the_recipe_s() -> None:
+    """The recipe has DDPO with ``gradient_steps: 8``, which NFT does not know."""
+    found = compose("post-train", PostTrainConfig, ["recipe=demo_clutter", "algorithm=nft"])
+    assert (found.algorithm, found.iterations) == (PostTrainConfig(algorithm="nft").algorithm, 24)
+    assert PostTrainConfig(recipe="demo_clutter", algorithm="nft") == found
+    assert changed(found, {"algorithm.name": "ddpo_sf"}).algorithm == PostTrainConfig().algorithm
+
+
+def test_an_option_of_a_file_is_one_of_the_group(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("network: paper")
+    source = str(tmp_path / "config.yaml")
+    found = compose("pretrain", PretrainConfig, ["network.depth=3"], config_file=source).network
+    assert (found.hidden, found.depth) == (512, 3)
+    (tmp_path / "config.yaml").write_text("network: papr")
+    with pytest.raises(UnknownNameError, match="unknown network 'papr'; did you mean 'paper'"):
+        compose("pretrain", PretrainConfig, [], config_file=source)
+
+
+@pytest.mark.parametrize("value", ["2", "1", "0", "1.0"])
+def test_a_number_is_no_boolean(value: str, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(f"network: {{modules: {{contacts: {value}}}}}\n")
+    with pytest.raises(InvalidInputError, match=f"network.modules.contacts={value} is not true or false"):
+        compose("pretrain", PretrainConfig, [], config_file=str(tmp_path / "config.yaml"))
+    with pytest.raises(InvalidInputError, match=f"project={value} is not true or false"):
+        compose("sample", CONFIGS["sample"], [f"project={value}"])
+    assert compose("sample", CONFIGS["sample"], ["project=yes"]).project is True
+
+
+@pytest.mark.parametrize(
     ("words", "key", "value"),
     [
         (["seed=${iterations}"], "seed", 60),
+        (["seed=0"], "seed", 0),
+        (["optimizer.lr=0.25"], "optimizer.lr", 0.25),
+        (["optimizer.lr=2"], "optimizer.lr", 2.0),
+        (["iterations=1_000"], "iterations", 1000),
         (["iterations=${algorithm.gradient_steps}"], "iterations", 8),
         (["optimizer={lr: 0.1}", "optimizer.lr=1e-4"], "optimizer.lr", 1e-4),
         (["optimizer.lr=1e-4", "optimizer={lr: 0.1}"], "optimizer.lr", 0.1),

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -141,7 +142,11 @@ def test_a_changed_footer_of_a_shard_is_found(tmp_path):
 
     path = tmp_path / "scenes-00000.parquet"
     write_bytes(path, encode_shard(np.zeros((3, 2, 16), np.float32), [("A scene.",)] * 3, {"tried": 5, "reasons": {}}))
-    assert read_notes(path) == {"tried": 5, "reasons": {}, "rows": 3}
+    notes = {"tried": 5, "reasons": {}, "rows": 3}
+    assert read_notes(path) == {
+        **notes,
+        "checksums": [zlib.crc32(bytes(3 * 2 * 16 * 4)), zlib.crc32(b"A scene.\0\0" * 3)],
+    }
     table = pq.read_table(path)
     notes = {key: value.replace(b'"tried": 5', b'"tried": 6') for key, value in table.schema.metadata.items()}
     pq.write_table(table.replace_schema_metadata(notes), path)
@@ -152,22 +157,45 @@ def test_a_changed_footer_of_a_shard_is_found(tmp_path):
         read_notes(path)
 
 
-def test_a_flipped_bit_in_the_pages_of_a_shard_is_found(tmp_path):
+def test_flipped_bits_anywhere_in_a_shard_are_found(tmp_path):
+    """In pages and, which parquet gives no checksum, in their headers and the footer, one bit at a time or two."""
     from scene_envs.datasets import SceneDataset, generate
 
     generate("dimsum_table", 4, tmp_path, workers=0, verify=False, progress=False)
     (shard,) = tmp_path.glob("*.parquet")
     assert read_notes(shard)["rows"] == 4
-    whole, expected = shard.read_bytes(), SceneDataset.load(tmp_path).batch().tensor
-    silent = 0
-    for bit in range(8 * 64, 8 * len(whole) // 2, 997):
+    whole, expected = shard.read_bytes(), SceneDataset.load(tmp_path)
+    found, silent, bits = 0, 0, 8 * len(whole)
+    pages, footer = range(8 * 64, bits // 2, 997), range(bits - 8 * 2400, bits, 61)
+    for flips in [*([bit] for bit in (*pages, *footer)), *([bit, bits - 1 - bit // 2] for bit in footer[::7])]:
         shard.write_bytes(whole)
-        flipped(shard, bit)
+        for bit in flips:
+            flipped(shard, bit)
         try:
-            silent += not torch.equal(SceneDataset.load(tmp_path).batch().tensor, expected)
+            read = SceneDataset.load(tmp_path)
+            silent += not torch.equal(read.tensor, expected.tensor) or read.prompt_sets != expected.prompt_sets
         except SceneEnvsError as error:
+            found += 1
             assert shard.name in str(error)  # noqa: PT017
     assert silent == 0
+    assert found > len(pages)
+
+
+def test_a_shard_that_reads_as_other_rows_is_found(tmp_path):
+    import pyarrow.parquet as pq
+
+    from scene_envs.datasets.files import encode_shard, read_rows, write_bytes
+
+    path = tmp_path / "scenes-00000.parquet"
+    write_bytes(path, encode_shard(np.zeros((3, 2, 16), np.float32), [("A scene.",), ("One.", "Two."), ("B",)], {}))
+    assert sum(len(rows.scenes) for rows in read_rows(path, 16)) == 3
+    table = pq.read_table(path)
+    for row, column, value in [(1, 0, [[0.0] * 15 + [1.0]] * 2), (2, 2, ["C"])]:
+        rows = table.to_pydict()
+        rows[table.column_names[column]][row] = value
+        pq.write_table(table.from_pydict(rows, table.schema), path)
+        with pytest.raises(CorruptFileError, match=r"scenes-00000.* are not those that were written; delete it"):
+            list(read_rows(path, 16))
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS])

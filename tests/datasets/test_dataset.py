@@ -132,6 +132,9 @@ def test_a_dataset_that_lost_scenes_says_so(
     assert not caplog.text
     shard = sorted(folder.glob("*.parquet"))[-1]
     pq.write_table(pq.read_table(shard).slice(1), shard)
+    with pytest.raises(CorruptFileError, match=r"15 rows were written, the file has 14\); delete it"):
+        SceneDataset.load(folder)
+    pq.write_table(pq.read_table(shard).replace_schema_metadata(), shard)  # changed on purpose
     assert len(SceneDataset.load(folder, limit=1)) == 1
     assert not caplog.text
     assert not SceneDataset.load(folder).complete

@@ -211,7 +211,7 @@ def test_a_broken_shard_is_named_before_work_starts(cups: Path, tmp_path: Path) 
     flipped = bytearray((cups / shard.name).read_bytes())
     flipped[len(flipped) // 4] ^= 1  # in a page of scenes; the footer stands at the end
     shard.write_bytes(flipped)
-    with pytest.raises(CorruptFileError, match=r"scenes-00001.*is damaged.*delete it"):
+    with pytest.raises(CorruptFileError, match=r"scenes-00001.*CRC checksum verification failed.*delete it"):
         generate_cups(tmp_path)
     shard.write_bytes((tmp_path / "scenes-00002.parquet").read_bytes())
     with pytest.raises(CorruptFileError, match=r"holds 10 scenes, expected 15"):

@@ -19,20 +19,19 @@ from scipy.spatial.transform import Rotation
 from agents.cli import main
 from agents.priors import ScenePrior
 from agents.priors.testing import tiny_prior
+from scene_envs.assets.base import identifiers
 from scene_envs.datasets import SceneDataset
 from scene_envs.errors import InvalidInputError, MissingDependencyError, UnknownNameError
 from scene_envs.export import AssetFiles, export, formats, list_formats, register_format
 from scene_envs.export.placed import (
-    Palette,
     angle_axis,
     exact_rotations,
     face_colors,
-    identifiers,
     quaternion,
     textured_mesh,
     visual_mesh,
 )
-from scene_envs.export.sdf import roll_pitch_yaw
+from scene_envs.export.urdf import roll_pitch_yaw
 from scene_envs.normalizer import Normalizer
 from scene_envs.physics.parts import PartGeometry
 from scene_envs.scene import SceneBatch
@@ -327,12 +326,11 @@ def test_textures_become_colours_and_photographs_few_enough_of_them():
     ball = trimesh.creation.icosphere(subdivisions=5)
     colors = np.random.default_rng(0).integers(0, 256, (len(ball.faces), 4)).astype(np.uint8)
     ball.visual = trimesh.visual.ColorVisuals(ball, face_colors=colors)
-    palette = Palette.of(ball)
-    assert len(palette.uv) <= 1024
-    rows = ((1.0 - palette.uv[palette.cells, 1]) * len(palette.image)).astype(int)
-    shown = palette.image[rows, (palette.uv[palette.cells, 0] * palette.image.shape[1]).astype(int)]
-    assert np.abs(shown.astype(int) - colors[:, :3]).max() <= 16
     textured = textured_mesh(odd_asset(ball))
+    image, uv = np.asarray(textured.visual.material.baseColorTexture), textured.visual.uv[textured.faces[:, 0]]
+    assert len(np.unique(textured.visual.uv, axis=0)) <= 1024
+    shown = image[((1.0 - uv[:, 1]) * len(image)).astype(int), (uv[:, 0] * image.shape[1]).astype(int)]
+    assert np.abs(shown.astype(int) - colors[:, :3]).max() <= 16
     np.testing.assert_allclose(textured.triangles, ball.triangles)
 
 

@@ -1,29 +1,62 @@
-"""Randomized masses, frictions and colours: what independent readers find in the files is what the JSON says."""
+"""Randomized physics and looks: what independent readers find in the files is what the JSON says."""
 
 from __future__ import annotations
 
 import json
+from pathlib import Path
+from xml.etree import ElementTree
 
+import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 from agents.cli import main
 from scene_envs.errors import InvalidInputError
 from scene_envs.export import export, place, verify
 from scene_envs.export.randomization import randomize, read_randomization
 from scene_envs.scene import SceneBatch
-from tests.helpers.export_scenes import jittered_scene, laid_scene
+from tests.helpers.examples import load_example
+from tests.helpers.export_scenes import DIMSUM, jittered_scene, laid_scene
 
 SETTINGS = {"seed": 3, "mass": {"uniform": [0.5, 2.0]}, "friction": {"triangular": [0.2, 0.5, 0.9]}}
 COLOR = {"color": {"normal": [0.9, 0.2]}}
+LOOKS = {
+    "seed": 3,
+    "color": {"uniform": [0.3, 0.9]},
+    "texture": {"choice": ["none", "checker", "gradient", "flat"]},
+    "light_direction": {"normal": [0.0, 0.3]},
+    "light_intensity": {"uniform": [0.5, 2.5]},
+    "light_color": {"uniform": [0.6, 1.0]},
+    "camera_position": {"uniform": [-0.2, 0.2]},
+    "camera_target": {"uniform": [-0.05, 0.05]},
+    "camera_fov_y": {"uniform": [-5.0, 10.0]},
+}
 
 
 def content(folder) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def said(folder, scene: str = "scene_000") -> dict:
+    return json.loads((folder / scene / "randomization.json").read_text())
+
+
 def objects(folder) -> dict:
-    return json.loads((folder / "scene_000" / "randomization.json").read_text())["objects"]
+    return said(folder)["objects"]
+
+
+def seen(camera: dict) -> np.ndarray:
+    """(3, 3): where x, y and z of the frame of OpenGL (right, up, backward) point, from position, target and up."""
+    backward = np.subtract(camera["position"], camera["target"])
+    right = np.cross(camera["up"], backward)
+    up = np.cross(backward, right)
+    return np.stack([axis / np.linalg.norm(axis) for axis in (right, up, backward)], axis=1)
+
+
+def linear(colors) -> np.ndarray:
+    """sRGB to linear light, by IEC 61966-2-1."""
+    return np.where(np.array(colors) <= 0.04045, np.array(colors) / 12.92, ((np.array(colors) + 0.055) / 1.055) ** 2.4)
 
 
 def assets() -> dict:
@@ -45,7 +78,6 @@ def test_draws_are_those_of_the_seed_and_the_scene_alone():
 
 
 def test_mujoco_reads_what_the_json_says(tmp_path):
-    mujoco = pytest.importorskip("mujoco")
     export(laid_scene(), tmp_path, "mjcf", randomization={**SETTINGS, **COLOR})
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene_000" / "scene.xml"))
     drawn = objects(tmp_path)
@@ -58,8 +90,9 @@ def test_mujoco_reads_what_the_json_says(tmp_path):
         visual, *parts = range(body.geomadr[0], body.geomadr[0] + body.geomnum[0])
         assert set(model.geom_friction[parts, 0]) == {drawn[name]["friction"]}
         color = drawn[name]["color"]
-        tint = [0.5] * 3 if min(color) == 1.0 else color  # a grey of 0.5 is none
+        tint = [0.5] * 3 if min(color) == 1.0 else color  # a grey of 0.5 is none, and the material's holds
         np.testing.assert_allclose(model.geom_rgba[visual], [*tint, 1.0], atol=1e-6)
+        np.testing.assert_allclose(model.mat_rgba[model.geom_matid[visual]], [*color, 1.0], atol=1e-6)
     assert min(min(row["color"]) for row in drawn.values()) < 0.9
 
 
@@ -107,6 +140,178 @@ def test_usd_reads_what_the_json_says(tmp_path):
         assert friction == pytest.approx(drawn[name]["friction"], rel=1e-6)
 
 
+def test_looks_are_those_of_their_distributions_and_of_the_scene_alone():
+    batch, nominal = SceneBatch.concatenate([jittered_scene(3), laid_scene()]), DIMSUM.camera
+    scenes = [randomize(scene, {**LOOKS, "seed": seed}) for seed in range(40) for scene in place(batch)]
+    again = randomize(place(laid_scene())[0], {**SETTINGS, **LOOKS, "seed": 39})
+    assert (again.light, again.camera) == (scenes[-1].light, scenes[-1].camera)
+    assert [(x.color, x.texture) for x in again.objects] == [(x.color, x.texture) for x in scenes[-1].objects]
+    assert len({scene.camera for scene in scenes}) == len({scene.light for scene in scenes}) == 80
+    colors = np.array([x.color for scene in scenes for x in scene.objects])
+    assert colors.min() >= 0.3
+    assert colors.max() <= 0.9
+    assert abs(colors.mean() - 0.6) < 4 * 0.6 / np.sqrt(12 * colors.size)  # four deviations of a mean of uniform draws
+    textures = [x.texture for scene in scenes for x in scene.objects]
+    for name in ("none", "checker", "gradient", "flat"):
+        assert abs(textures.count(name) / len(textures) - 0.25) < 4 * np.sqrt(0.25 * 0.75 / len(textures))
+    for scene in scenes:
+        assert np.linalg.norm(scene.light.direction) == pytest.approx(1.0, abs=1e-15)
+        assert 0.5 <= scene.light.intensity <= 2.5
+        assert 0.6 <= min(scene.light.color) <= max(scene.light.color) <= 1.0
+        assert np.abs(np.subtract(scene.camera.position, nominal.position)).max() <= 0.2
+        assert np.abs(np.subtract(scene.camera.target, nominal.target)).max() <= 0.05
+        assert -5.0 <= scene.camera.fov_y - nominal.fov_y <= 10.0
+        assert (scene.camera.up, scene.camera.width) == (nominal.up, nominal.width)
+    plain = randomize(place(laid_scene())[0], SETTINGS)
+    assert (plain.light, plain.camera) == (place(laid_scene())[0].light, nominal)
+
+
+def test_a_scene_that_repeats_looks_different_each_time(tmp_path):
+    batch = SceneBatch.concatenate([laid_scene(), jittered_scene(3), laid_scene()])
+    export(batch, tmp_path / "three", "npz", randomization=LOOKS)
+    export(batch[[1, 2, 0]], tmp_path / "turned", "npz", randomization=LOOKS)
+    names = ("scene_000", "scene_001", "scene_002")
+    first, other, again = (said(tmp_path / "three", name) for name in names)
+    assert [said(tmp_path / "turned", name) for name in names] == [other, first, again]
+    assert first["camera"] != again["camera"]
+    assert first["objects"]["teacup_0"]["color"] != again["objects"]["teacup_0"]["color"]
+
+
+def test_mujoco_reads_the_looks_and_physics_stays_bit_for_bit(tmp_path):
+    models = []
+    for name, settings in (("plain", {}), ("looks", LOOKS)):
+        export(laid_scene(), tmp_path / name, "mjcf", randomization=settings)
+        models.append(mujoco.MjModel.from_xml_path(str(tmp_path / name / "scene_000" / "scene.xml")))
+    plain, model = models
+    for field in ("body_pos", "body_quat", "body_mass", "body_inertia", "body_ipos", "body_iquat", "geom_friction"):
+        np.testing.assert_array_equal(getattr(model, field), getattr(plain, field), err_msg=field)
+    states = [mujoco.MjData(one) for one in models]
+    for one, data in zip(models, states, strict=True):
+        mujoco.mj_step(one, data, 20)
+    for field in ("pos", "dist", "frame"):
+        np.testing.assert_array_equal(getattr(states[0].contact, field), getattr(states[1].contact, field))
+    np.testing.assert_array_equal(states[0].qpos, states[1].qpos)
+    drawn = said(tmp_path / "looks")
+    light, camera = drawn["light"], drawn["camera"]
+    np.testing.assert_allclose(model.light("lamp").dir, light["direction"], atol=1e-12)
+    np.testing.assert_allclose(
+        model.light("lamp").diffuse, 0.3 * light["intensity"] * np.array(light["color"]), rtol=1e-6
+    )
+    np.testing.assert_allclose(states[1].cam("scene").xpos, camera["position"], atol=1e-12)
+    np.testing.assert_allclose(states[1].cam("scene").xmat.reshape(3, 3), seen(camera), atol=1e-12)
+    assert model.cam("scene").fovy[0] == pytest.approx(camera["fov_y"], rel=1e-12)
+    kinds = set()
+    for name, row in drawn["objects"].items():
+        visual = model.body(name).geomadr[0]
+        np.testing.assert_allclose(model.geom_rgba[visual], [*row["color"], 1.0], atol=1e-6)
+        texture = model.tex(model.mat_texid[model.geom_matid[visual], 1])
+        pixels = model.tex_data[texture.adr[0] :][: 3 * texture.width[0] * texture.height[0]].reshape(-1, 3)
+        assert row["texture"] == "none" or (pixels == pixels[:, :1]).all()  # grey
+        levels = {"checker": {102, 255}, "flat": {255}}.get(row["texture"], set(pixels[:, 0].tolist()))
+        assert set(pixels[:, 0].tolist()) == levels
+        kinds.add(row["texture"])
+    assert kinds == {"none", "checker", "gradient", "flat"}
+    assert drawn["units"]["camera_fov_y"] == "added to the vertical field of view, degrees"
+    assert drawn["left_out"] == {}
+
+
+def test_usd_reads_the_looks(tmp_path):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdLux, UsdShade
+
+    export(laid_scene(), tmp_path / "plain", "usd")
+    plain = Usd.Stage.Open(str(tmp_path / "plain" / "scene_000.usda"))
+    assert not [prim for prim in plain.Traverse() if prim.IsA(UsdGeom.Camera) or prim.HasAPI(UsdLux.LightAPI)]
+    report = export(laid_scene(), tmp_path / "looks", "usd", randomization=LOOKS)
+    stage = Usd.Stage.Open(str(report.scenes[0]["usd"]))
+    drawn = said(tmp_path / "looks")
+    lamp = UsdLux.DistantLight(stage.GetPrimAtPath("/World/lamp"))
+    assert lamp.GetIntensityAttr().Get() == pytest.approx(1000.0 * drawn["light"]["intensity"], rel=1e-6)
+    np.testing.assert_allclose(lamp.GetColorAttr().Get(), linear(drawn["light"]["color"]), rtol=1e-5)
+    turn = np.array(UsdGeom.Xformable(lamp).ComputeLocalToWorldTransform(0))[:3, :3].T
+    np.testing.assert_allclose(turn @ [0.0, 0.0, -1.0], drawn["light"]["direction"], atol=1e-12)  # where it shines
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/World/camera")).GetCamera()
+    assert camera.GetFieldOfView(camera.FOVVertical) == pytest.approx(drawn["camera"]["fov_y"], rel=1e-5)
+    assert camera.aspectRatio == pytest.approx(drawn["camera"]["width"] / drawn["camera"]["height"], rel=1e-6)
+    pose = np.array(camera.transform).T
+    np.testing.assert_allclose(pose[:3, 3], drawn["camera"]["position"], atol=1e-12)
+    np.testing.assert_allclose(pose[:3, :3], seen(drawn["camera"]), atol=1e-12)
+    for name, row in drawn["objects"].items():
+        prim = stage.GetPrimAtPath(f"/World/{name}/visual")
+        shown, own = (
+            UsdGeom.PrimvarsAPI(other.GetPrimAtPath(f"/World/{name}/visual")).GetPrimvar("displayColor")
+            for other in (stage, plain)
+        )
+        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        surface, _, _ = material.ComputeSurfaceSource()
+        (source,), _ = surface.GetInput("diffuseColor").GetConnectedSources()
+        shader = UsdShade.Shader(source.source.GetPrim())
+        if row["texture"] == "none":
+            assert shader.GetIdAttr().Get() == "UsdPrimvarReader_float3"
+            colors = np.array(own.ComputeFlattened())  # linear light; the factor is on sRGB
+            screen = np.where(colors <= 0.0031308, 12.92 * colors, 1.055 * colors ** (1 / 2.4) - 0.055)
+            np.testing.assert_allclose(shown.ComputeFlattened(), linear(screen * row["color"]), atol=1e-6)
+        else:
+            assert shader.GetIdAttr().Get() == "UsdUVTexture"
+            scale = shader.GetInput("scale").Get()
+            np.testing.assert_allclose(scale, [*linear(row["color"]), 1.0], rtol=1e-5)
+            image = Path(shader.GetInput("file").Get().resolvedPath)
+            assert image.name == f"visual_{row['texture']}.png"
+            (reader,), _ = shader.GetInput("st").GetConnectedSources()
+            assert UsdShade.Shader(reader.source.GetPrim()).GetInput("varname").Get() == "st"
+        corners = np.array(UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").Get())
+        assert len(corners) == len(UsdGeom.Mesh(prim).GetPointsAttr().Get())
+        assert (corners.min(), corners.max()) == (0.0, 1.0)
+
+
+def test_other_formats_hold_colours_and_textures_and_say_what_they_leave_out(tmp_path):
+    formats = ["urdf", "sdf", "glb", "npz"]
+    export(laid_scene(), tmp_path, formats, randomization=LOOKS)
+    folder, drawn = tmp_path / "scene_000", said(tmp_path)
+    lamp = ["light_direction", "light_intensity", "light_color"]
+    camera = ["camera_position", "camera_target", "camera_fov_y"]
+    rest = {"glb": lamp + camera, "npz": ["color", "texture", *lamp, *camera], "sdf": camera, "urdf": lamp + camera}
+    assert drawn["left_out"] == rest
+    world = ElementTree.parse(folder / "world.sdf").getroot().find("world")
+    direction = [float(x) for x in world.find("light/direction").text.split()]
+    np.testing.assert_array_equal(direction, drawn["light"]["direction"])
+    assert float(world.find("light/intensity").text) == drawn["light"]["intensity"]
+    urdfs = {item["name"]: item["urdf"] for item in json.loads((folder / "objects.json").read_text())["objects"]}
+    scene = trimesh.load(folder / "scene.glb")
+    for name, row in drawn["objects"].items():
+        stem = "visual" if row["texture"] == "none" else f"visual_{row['texture']}"
+        visual = world.find(f"model[@name='{name}']/link/visual")
+        assert visual.find("material/diffuse").text.split()[:3] == [repr(x) for x in row["color"]]
+        for place_of in ("geometry/mesh/uri", "material/pbr/metal/albedo_map"):
+            assert (folder / visual.find(place_of).text).is_file()
+        assert Path(visual.find("geometry/mesh/uri").text).stem == stem
+        visual = ElementTree.parse(folder / urdfs[name]).getroot().find("link/visual")
+        assert visual.find("material/color").attrib["rgba"].split()[:3] == [repr(x) for x in row["color"]]
+        mesh = trimesh.load((folder / urdfs[name]).parent / visual.find("geometry/mesh").attrib["filename"])
+        image = np.asarray(mesh.visual.material.image)[..., :3]
+        (node,) = (geometry for _, geometry in (scene.graph[name],))
+        material = scene.geometry[node].visual.material
+        np.testing.assert_allclose(material.baseColorFactor[:3] / 255.0, linear(row["color"]), atol=0.51 / 255.0)
+        np.testing.assert_array_equal(np.asarray(material.baseColorTexture)[..., :3], image)
+
+
+def test_worlds_hold_the_looks_of_each_scene(tmp_path):
+    export(SceneBatch.concatenate([laid_scene(), jittered_scene(3)]), tmp_path, ["mjcf", "worlds"], randomization=LOOKS)
+    example = load_example("worlds")
+    for world, folder in enumerate(("scene_000", "scene_001")):
+        own = mujoco.MjModel.from_xml_path(str(tmp_path / folder / "scene.xml"))
+        model, _ = example.mujoco_world(tmp_path / "worlds.npz", world)
+        for field in ("light_dir", "light_diffuse", "cam_pos", "cam_quat", "cam_fovy"):
+            np.testing.assert_allclose(getattr(model, field), getattr(own, field), atol=1e-12, err_msg=field)
+        for body, name in enumerate(np.load(tmp_path / "worlds.npz")["names"][world].tolist(), start=1):
+            materials = [
+                (m.mat_rgba[material].tolist(), m.tex(m.mat_texid[material, 1]).name)
+                for m, b in ((model, model.body(body)), (own, own.body(name)))
+                for material in [m.geom_matid[b.geomadr[0]]]
+            ]
+            assert materials[0] == materials[1], name
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "file"), [("sdf", "world.sdf"), ("drake", "scene.dmd.yaml")])
 def test_drake_reads_what_the_json_says(name, file, tmp_path):
@@ -147,6 +352,8 @@ def test_the_certificate_judges_the_randomized_files(tmp_path):
     report = verify(tmp_path)
     assert "MuJoCo, MJCF" in report.versions
     assert "other friction or masses" in report.missing["mujoco engine"]
+    export(laid_scene(), tmp_path / "looks", ["npz", "mjcf"], randomization=LOOKS)
+    assert "mujoco engine" in verify(tmp_path / "looks").versions  # looks move nothing
 
 
 def test_wrong_input_is_named(tmp_path):
@@ -160,8 +367,10 @@ def test_wrong_input_is_named(tmp_path):
             read_randomization(wrong)
     with pytest.raises(InvalidInputError, match="must be above 0"):
         export(laid_scene(), tmp_path / "a", "mjcf", randomization={"mass": {"uniform": [-2.0, -1.0]}})
-    with pytest.raises(InvalidInputError, match=r"only mjcf carries randomized colours.*urdf"):
-        export(laid_scene(), tmp_path / "a", ["mjcf", "urdf"], randomization=COLOR)
+    with pytest.raises(InvalidInputError, match="light_intensity=-1 was drawn"):
+        export(laid_scene(), tmp_path / "a", "mjcf", randomization={"light_intensity": {"uniform": [-1.0, -1.0]}})
+    with pytest.raises(InvalidInputError, match="between 0 and 180 degrees, got fov_y=245"):
+        export(laid_scene(), tmp_path / "a", "mjcf", randomization={"camera_fov_y": {"uniform": [200.0, 200.0]}})
     assert not (tmp_path / "a").exists()
 
 
@@ -192,6 +401,10 @@ def test_worlds_hold_what_the_json_says(tmp_path):
     [
         ({"weight": {"uniform": [1, 2]}}, "unknown key 'weight'"),
         ({"mass": {"gauss": [1, 2]}}, "mass: unknown distribution 'gauss'"),
+        ({"mass": {"choice": [1, 2]}}, "mass: unknown distribution 'choice'"),
+        ({"texture": {"uniform": [0, 1]}}, "texture: unknown distribution 'uniform'"),
+        ({"texture": {"choice": ["checker", "marble"]}}, r"texture: unknown marble.*\[none, checker, gradient, flat\]"),
+        ({"mass": {"normal": [0, float("inf")]}}, "draws numbers that are not finite"),
         ({"mass": {"uniform": [0, float("inf")]}}, "range exceeds valid bounds"),
         ({"mass": {"uniform": np.array([1.0, 2.0])}}, "not JSON serializable"),
         ({"seed": -1}, "non-negative"),
@@ -212,12 +425,11 @@ def test_formats_join_a_randomized_export_and_other_values_are_named(tmp_path):
         export(batch, tmp_path, "sdf", friction=0.5, randomization={"mass": {"uniform": [0.7, 1.4]}})
 
 
-def test_the_commands_refuse_colours_and_lost_settings_before_they_work(tmp_path, capsys):
+def test_the_commands_refuse_what_cannot_be_drawn_and_lost_settings_before_they_work(tmp_path, capsys):
     file = tmp_path / "colour.yaml"
-    file.write_text("color: {uniform: [0.5, 1]}")
+    file.write_text("colour: {uniform: [0.5, 1]}")
     assert main(["export", "scenes=none", "formats=drake", f"randomization={file}"]) == 2
-    assert "only mjcf carries randomized colours" in capsys.readouterr().err
-    assert main(["sample", "export=[mjcf, sdf]", f"randomization={file}"]) == 2
-    assert "leave out color, or sdf" in capsys.readouterr().err
+    assert "unknown key 'colour'; write seed: 0" in capsys.readouterr().err
+    file.write_text("color: {uniform: [0.5, 1]}")
     assert main(["sample", f"randomization={file}"]) == 2
     assert "randomization= changes exported scenes; add export=" in capsys.readouterr().err

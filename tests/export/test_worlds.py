@@ -17,7 +17,7 @@ from agents.cli import main
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
 from scene_envs.export import export, list_formats, place, worlds
-from scene_envs.export.formats import check_formats
+from scene_envs.export.formats import resolve_formats
 from scene_envs.grammars import get_grammar
 from scene_envs.scene import SceneBatch
 from tests.helpers.examples import load_example
@@ -92,7 +92,7 @@ def test_a_world_is_the_scene_of_its_own_mjcf_file(folder, example):
             for field in GEOMETRY:
                 ours, theirs = getattr(model, field)[first : first + number], getattr(own, field)[start:][:number]
                 np.testing.assert_array_equal(ours, theirs, err_msg=f"{name} {field}")
-            shown, theirs = (m.mat(m.geom_matid[g]).name for m, g in ((model, first), (own, start)))
+            shown, theirs = (m.tex(m.mat_texid[m.geom_matid[g], 1]).name for m, g in ((model, first), (own, start)))
             assert shown == theirs
             np.testing.assert_array_equal(
                 model.geom_friction[first + 1 : first + number], own.geom_friction[start + 1 : start + number]
@@ -146,7 +146,8 @@ def test_worlds_of_mujoco_warp_are_the_scenes(folder, example):
 def test_a_model_with_a_robot_takes_the_scenes_beside_it(tmp_path, example):
     export(laid_scene(), tmp_path, "worlds")
     spec = mujoco.MjSpec.from_string(
-        '<mujoco><asset><mesh name="tool" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/><material name="red"/></asset><worldbody>'
+        '<mujoco><asset><mesh name="tool" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/><texture name="wood" builtin="flat" '
+        'type="2d" width="8" height="8"/><material name="red" texture="wood"/></asset><worldbody>'
         '<body name="robot" pos="0 0 3"><freejoint/><geom type="mesh" mesh="tool" material="red"/></body>'
         "</worldbody></mujoco>"
     )
@@ -165,8 +166,9 @@ def test_a_model_with_a_robot_takes_the_scenes_beside_it(tmp_path, example):
     assert beside["geom_dataid"][0, 0] == 0
     meshes = [model.mesh(mesh).name for mesh in beside["geom_dataid"][0, 1:] if mesh >= 0]
     assert meshes == [f"scene/{alone.mesh(mesh).name}" for mesh in fields["geom_dataid"][0] if mesh >= 0]
-    shown = {model.mat(material).name for material in beside["geom_matid"][0, 1:] if material >= 0}
+    shown = {model.tex(texture).name for texture in beside["mat_texid"][0, 1:, 1] if texture >= 0}
     assert shown == {f"scene/{name}" for name in laid_scene().names()[0]}
+    assert beside["mat_texid"][0, 0, 1] == model.tex("wood").id
 
 
 def test_arrays_say_which_object_is_where(tmp_path):
@@ -242,7 +244,7 @@ def test_a_mass_of_its_own_is_that_of_the_world(tmp_path, example):
 
 def test_impossible_worlds_are_refused(tmp_path, monkeypatch):
     assert "worlds" in list_formats()
-    assert "worlds" not in check_formats("all")  # those have a file for each scene
+    assert "worlds" not in resolve_formats("all")  # those have a file for each scene
     with pytest.raises(InvalidInputError, match="worlds of 0 scenes without objects"):
         export(SceneBatch(torch.zeros(0, 3, DIMSUM.features), DIMSUM), tmp_path / "none", "worlds")
     empty = torch.zeros(2, 3, DIMSUM.features)

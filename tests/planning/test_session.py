@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from agents.cli import main
-from agents.planning import PlanResult, Session, run_search
+from agents.planning import BestOfPlanner, GradientPlanner, PlanResult, Session, run_search
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from rewards import RewardContext, RewardOutput, register_reward
@@ -123,6 +123,40 @@ def test_limits(planner: str, prior: ScenePrior) -> None:
     by_time = run_search(prior, near_middle, **settings, max_seconds=1e-9)
     assert by_time.metrics["stopped"] == "time"
     assert by_time.search.values == by_nfe.search.values[:3]
+
+
+class Slow(ToyTree):
+    """A tree on whose clock a child takes a quarter of a second."""
+
+    now = 0.0
+
+    def expand_batch(self, pairs: Any, steering: Any = None) -> Any:
+        self.now += 0.25 * len(pairs)
+        return super().expand_batch(pairs)
+
+
+@pytest.mark.parametrize("roots", [[()], [(7,), (8,)]])
+def test_a_limit_of_time_ends_a_batch_of_any_size(roots: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = Slow(scrambled, branching=64)
+    monkeypatch.setattr("agents.planning.session.time.perf_counter", lambda: tree.now)
+    session = Session(tree, max_seconds=10.125)
+    results = session.run(BestOfPlanner(parallel=64), roots, budget=64)
+    assert (session.stopped, tree.now) == ("time", 10.25)  # 40 scenes fit, and one goes beyond
+    assert tree.batches == [16, 24, 1]
+    made = results[0].values
+    assert made == [scrambled((*roots[0], action)) for action in range(41)]
+    assert results[0].best_value == max(made) == scrambled(results[0].best_state)
+    assert [len(result.values) for result in results[1:]] == [0] * (len(roots) - 1)
+
+
+def test_a_limit_of_time_keeps_the_children_of_a_parent_together_where_a_planner_steers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tree = Slow(scrambled, branching=64)
+    monkeypatch.setattr("agents.planning.session.time.perf_counter", lambda: tree.now)
+    session = Session(tree, max_seconds=6.0)
+    session.run(GradientPlanner(planner={"name": "greedy", "children": 10}), [(7,), (8,), (9,)], budget=20)
+    assert tree.batches == [20, 10]
 
 
 @pytest.mark.slow

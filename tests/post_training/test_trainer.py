@@ -128,6 +128,20 @@ def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, ch
     assert parts.metrics["guard"] == whole.metrics["guard"]
 
 
+def test_one_step_of_importance_weights_is_the_score_function_and_the_default_is_four(tmp_path: Path) -> None:
+    """Before the first step the ratio is 1, so a single step of DDPO-IS is that of DDPO-SF; the next ones are not."""
+    trained = {}
+    for name, algorithm in {
+        "sf": {"name": "ddpo_sf"}, "one": {"name": "ddpo_is", "updates": 1},
+        "four": {"name": "ddpo_is", "updates": 4}, "default": {"name": "ddpo_is"},
+    }.items():  # fmt: skip
+        post_train(small_config(tmp_path / name, iterations=1, algorithm=algorithm), prior=tiny_prior())
+        trained[name] = torch.cat([tensor.flatten() for tensor in weights(tmp_path / name).values()])
+    assert torch.equal(trained["sf"], trained["one"])
+    assert torch.equal(trained["default"], trained["four"])
+    assert not torch.equal(trained["default"], trained["one"])
+
+
 def killed_in_iteration_four(output: Path) -> None:
     torch.set_num_threads(1)
     calls = 0

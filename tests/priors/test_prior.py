@@ -61,8 +61,8 @@ def test_same_seed_same_scenes(prior: ScenePrior) -> None:
 def test_the_last_step_is_deterministic_and_known_entries_have_no_noise(prior: ScenePrior) -> None:
     table = prior.step_table(10)
     x = prior.initial(2, 34, torch.Generator().manual_seed(0))
-    _, first = prior.posterior(x, 0, table)
-    _, last = prior.posterior(x, 9, table)
+    first = prior.transition(x, 0, table).std
+    last = prior.transition(x, 9, table).std
     assert bool((first[0] == 0).all())
     assert bool((first[1:, :2] > 0).all())
     assert bool((last == 0).all())

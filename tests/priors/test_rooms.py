@@ -269,6 +269,17 @@ def test_any_assets_can_be_asked_for(union_prior: MixedPrior) -> None:
     assert all(mixes(union_prior.with_union("any").sample(10, num_steps=20, seed=0)))
 
 
+def test_settings_of_categories_are_those_of_mixed_priors_alone() -> None:
+    mixed, continuous = tiny_prior(process="mixed"), tiny_prior(process="continuous")
+    before = continuous.config
+    assert mixed.with_union("any").with_open_empty(0.3) is mixed
+    assert (mixed.config.union, mixed.config.open_empty_share) == ("any", 0.3)
+    assert continuous.with_union("any").with_open_empty(0.3) is continuous
+    assert continuous.config is before
+    with pytest.raises(UnknownNameError, match="one_type"):
+        continuous.with_union("one")
+
+
 def test_an_unknown_rule_names_the_known_ones(union_prior: MixedPrior) -> None:
     with pytest.raises(UnknownNameError, match="one_type"):
         union_prior.with_union("one")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from agents.utils.loggers import LOGGERS, RunLogger
-from scene_envs.errors import MissingDependencyError, UnknownNameError
+from scene_envs.errors import MissingDependencyError
 
 
 def test_csv_adds_nothing_to_the_log_of_the_run(tmp_path: Path) -> None:
@@ -47,8 +47,3 @@ def test_a_missing_package_is_named_with_its_extra(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(importlib.util, "find_spec", lambda package: None)
     with pytest.raises(MissingDependencyError, match=rf"logger={name} needs .*scene-envs\[{name}\]"):
         RunLogger(name, tmp_path)
-
-
-def test_an_unknown_logger_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'tensorboard'"):
-        RunLogger("tensorbord", tmp_path)

@@ -197,7 +197,7 @@ class _Results:
         changed = {key for key in {*known, *identity} if known.get(key) != identity.get(key)}
         if not changed:
             return
-        check_same_keys(run.directory, known, identity, ("digest", *_OF_PROMPTS))
+        check_same_keys(run.directory, known, identity, ("digest", *_OF_PROMPTS), EvaluateConfig)
         stale = [_PROMPTED]
         if known and changed <= _OF_PROMPTS:
             if self.groups.pop("prompts", None) is not None:

@@ -64,7 +64,7 @@ class ExportConfig(DrawKeys, EngineKeys):
         count: number of scenes; null for all of them, or 16 from a prior.
         project: make the scenes simulation-ready first (project out of penetration, then settle).
         friction: coefficient of friction of all surfaces.
-        randomization: YAML file with distributions of mass, friction and color; empty for none.
+        randomization: YAML file with distributions of mass, friction, color, texture, light and camera; empty for none.
         output: folder for assets/ and scene_000/, scene_001/, ...
     """
 
@@ -80,7 +80,7 @@ class ExportConfig(DrawKeys, EngineKeys):
 
 def check(settings: ExportConfig) -> None:
     """Refuse impossible settings before scenes are read."""
-    from scene_envs.export.formats import check_formats
+    from scene_envs.export.formats import resolve_formats
     from scene_envs.export.randomization import read_randomization
 
     if bool(settings.scenes) == bool(settings.prior):
@@ -88,22 +88,21 @@ def check(settings: ExportConfig) -> None:
             "export: name either a scene file, run or dataset, as in scenes=runs/mine, or a prior, as in "
             "prior=dimsum_table"
         )
-    read_randomization(settings.randomization, check_formats(settings.formats))
+    resolve_formats(settings.formats)
+    read_randomization(settings.randomization)
 
 
 def run(settings: ExportConfig, run: Run) -> None:
     """Read or draw the scenes and write them."""
-    from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import make_pool
 
-    formats = resolve_formats(settings.formats)
     batch = _scenes(settings, run)
     keys = {"friction": settings.friction, "randomization": settings.randomization}
     metrics: dict[str, Any] = {}
     with make_pool(settings.workers, physics=settings.physics) as pool:
         if settings.project:
             batch, metrics["ready"] = make_ready(batch, 0, pool, run)
-        metrics |= export_scenes(batch, formats, run.directory, pool, run, **keys)
+        metrics |= export_scenes(batch, settings.formats, run.directory, pool, run, **keys)
     run.write_metrics(metrics)
 
 
@@ -119,6 +118,8 @@ def export_scenes(
     seconds = time.perf_counter() - started
     size = f"{report.size / 1e6:.1f} MB"
     run.say(f"{len(batch)} scenes as {', '.join(report.formats)} in {output}: {size}, {seconds:.1f} s")
+    for note in report.notes:
+        run.say(note)
     overlapping = int((penetration(batch, pool=pool).depth.amax(dim=1) > _OVERLAP).sum()) if len(batch) else 0
     if overlapping:
         run.say(

@@ -34,7 +34,8 @@ class SampleConfig(PromptKeys, SamplingKeys, DrawKeys, RewardLimitKeys, OutputKe
         project: also make the samples simulation-ready (project out of penetration, then settle).
         export: formats of the exported scenes, as drake or [drake, mjcf]; null for none. With project=true the
             simulation-ready scenes are exported. See scene-envs export.
-        randomization: YAML file with distributions of mass, friction and color for the export; empty for none.
+        randomization: YAML file with distributions of mass, friction, color, texture, light and camera for the export;
+            empty for none.
         verify: export only scenes that all installed engines and simulators find ready; needs project=true and export=.
         output: folder for scenes.safetensors and gallery.png, with project=true also ready.safetensors and ready.png;
             exported scenes are in its folder export/.
@@ -53,11 +54,12 @@ class SampleConfig(PromptKeys, SamplingKeys, DrawKeys, RewardLimitKeys, OutputKe
 
 def check(settings: SampleConfig) -> None:
     """Refuse impossible settings before a prior is loaded."""
-    from scene_envs.export.formats import check_formats
+    from scene_envs.export.formats import resolve_formats
     from scene_envs.export.randomization import read_randomization
 
-    formats = () if settings.export is None else check_formats(settings.export)
-    if read_randomization(settings.randomization, formats) and not formats:
+    if settings.export is not None:
+        resolve_formats(settings.export)
+    if read_randomization(settings.randomization) and settings.export is None:
         raise InvalidInputError("randomization= changes exported scenes; add export=, as export=mjcf")
     if settings.verify and not (settings.project and settings.export is not None):
         raise InvalidInputError("verify=true judges exported scenes; add project=true and export=, as export=mjcf")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from types import SimpleNamespace
-from typing import Any
 
 from agents.cli.run_folder import Run
 from agents.post_training.settings import PostTrainConfig
@@ -24,13 +22,16 @@ def run_pretrain(settings: PretrainConfig, run: Run) -> None:
 def run_post_train(settings: PostTrainConfig, run: Run) -> None:
     """Post-train and report; the trainer and the report write the metrics."""
     from agents.post_training import post_train, post_train_and_compare
+    from agents.post_training.report import rows_with_change
     from agents.utils.process_group import is_first_process
 
     if not is_first_process():
         post_train(settings)
     elif settings.logger.report_scenes:
         metrics = post_train_and_compare(settings, scenes=settings.logger.report_scenes)
-        say_change(metrics, run)
+        for label, *cells in rows_with_change(metrics["before"], metrics["after"]):
+            run.say(f"{label:<40} " + "  ".join(f"{cell:>14}" for cell in cells))
+        run.say(f"held-out loss {metrics['guard']['ratio']:.2f}x of the base prior's")
         run.say(f"open {run.directory / 'report.html'}")
     else:
         metrics = post_train(settings).metrics
@@ -41,24 +42,6 @@ def run_post_train(settings: PostTrainConfig, run: Run) -> None:
         if lost := metrics["reward"]["invalid_scenes"]:
             run.say(f"{lost} scenes without a valid reward; log.txt says why")
     run.say(f"sample it: scene-envs sample prior={run.directory}")
-
-
-def say_change(metrics: Mapping[str, Any], run: Run) -> None:
-    """Report each figure before and after the training, one line each."""
-    before, after = metrics["before"], metrics["after"]
-    for name, label in (
-        ("reward", "the trained reward"),
-        ("objects", "objects per scene"),
-        ("feasible_objects", "feasible as sampled"),
-        ("ready_objects", "simulation-ready"),
-        ("prompt_match", "match of the prompts"),
-    ):
-        if name in before and name in after:
-            change = f"  ({after[name] / before[name] - 1:+.0%})" if before[name] > 0 else ""
-            run.say(f"{label:<20} {before[name]:6.2f} -> {after[name]:6.2f}{change}")
-    run.say(f"{'held-out loss':<20} {metrics['guard']['ratio']:.2f}x of the base prior's")
-    if before["invalid_scenes"] or after["invalid_scenes"]:
-        run.say(f"{'simulation ended':<20} {before['invalid_scenes']:6.0f} -> {after['invalid_scenes']:6.0f} scenes")
 
 
 def run_doctor(settings: PostTrainConfig, run: Run) -> None:

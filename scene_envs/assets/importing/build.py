@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import colorsys
 import dataclasses
-import difflib
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from scene_envs.arrays import Array
-from scene_envs.assets.base import Asset, ConvexPart, bounds_of, regular_plural
+from scene_envs.assets.base import Asset, ConvexPart, Joint, bounds_of, identifier, identifiers, regular_plural
 from scene_envs.assets.importing.limits import seconds_left
 from scene_envs.assets.importing.mesh_files import (
     MESH_SUFFIXES,
@@ -25,6 +23,7 @@ from scene_envs.assets.importing.mesh_files import (
     Shape,
     heavier,
     merged_inertial,
+    moved_inertial,
     pose_of,
 )
 from scene_envs.assets.importing.robot_files import read_mjcf, read_sdf, read_urdf, read_usd
@@ -39,7 +38,7 @@ from scene_envs.assets.importing.solids import (
     visual_of,
 )
 from scene_envs.assets.shapes import MassProperties, join, mass_properties, moved
-from scene_envs.errors import CorruptFileError, InvalidInputError
+from scene_envs.errors import Checked, CorruptFileError, InvalidInputError, Limit, Positive, unknown_name
 
 if TYPE_CHECKING:
     import trimesh
@@ -50,9 +49,6 @@ SUFFIXES = (".urdf", ".sdf", ".xml", ".usd", ".usda", ".usdc", *MESH_SUFFIXES)
 """Files that can become assets."""
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Base = Literal["bottom", "origin"]
-_TEXTS = ("file", "name", "display_name", "plural")
-_NUMBERS = ("scale", "density", "mass", "concavity")
-_CHOICES = {key: get_args(kind) for key, kind in (("up", Axis), ("base", Base), ("decomposition", Method))}
 DEFAULT_DENSITY = 500.0
 """Density (kg/m^3) used where neither the file nor the user gives one: wood, or a ceramic vessel with its air."""
 _POSSIBLE = (1.0, 23_000.0)
@@ -72,23 +68,32 @@ _SMALL, _LARGE = 2e-3, 20.0
 """Smallest and largest plausible diagonal (m); beyond them the file is probably not in metres."""
 
 
+def _one_of(words: Any) -> Limit:
+    return Limit(lambda value: value in get_args(words), f"must be one of {', '.join(get_args(words))}")
+
+
+_Text = Annotated[str, Limit(lambda value: isinstance(value, str), "must be text; put it in quotes")]
+
+
 @dataclass(frozen=True)
-class AssetEntry:
+class AssetEntry(Checked):
     """One asset of a library: its file, its names and how its file becomes a body."""
 
-    file: str  # relative to the folder
-    name: str = ""  # identifier; by default the stem of the file
-    display_name: str = ""  # in prompts; by default the identifier with spaces
-    plural: str = ""  # of the display name; the regular one by default
-    scale: float = 1.0  # factor on all lengths; a file in millimetres needs 0.001
-    density: float | None = None  # kg/m^3, of the evenly filled shape
-    mass: float | None = None  # kg
+    file: _Text  # relative to the folder
+    name: _Text = ""  # identifier; by default the stem of the file
+    display_name: _Text = ""  # in prompts; by default the identifier with spaces
+    plural: _Text = ""  # of the display name; the regular one by default
+    scale: Positive = 1.0  # factor on all lengths; a file in millimetres needs 0.001
+    density: Positive | None = None  # kg/m^3, of the evenly filled shape
+    mass: Positive | None = None  # kg
     welded: bool | None = None  # to the world; the file decides by default
-    up: Axis = "z"  # axis of the file that points up
+    up: Annotated[Axis, _one_of(Axis)] = "z"  # axis of the file that points up
     color: Color | None = None  # class colour (r, g, b), also for surfaces without one
-    base: Base = "bottom"  # "bottom": frame under the middle of the bounding box; "origin": as in the file
-    decomposition: Method = "auto"  # see convex_parts
-    concavity: float = 0.05  # CoACD's threshold, 0.01 (many parts) to 1 (one)
+    base: Annotated[Base, _one_of(Base)] = (
+        "bottom"  # "bottom": frame under the middle of the bounding box; "origin": as in the file
+    )
+    decomposition: Annotated[Method, _one_of(Method)] = "auto"  # see convex_parts
+    concavity: Positive = 0.05  # CoACD's threshold, 0.01 (many parts) to 1 (one)
 
 
 def read_entries(path: Path) -> list[AssetEntry]:
@@ -132,8 +137,8 @@ def default_entry(file: str) -> AssetEntry:
 def _named(values: dict[str, Any]) -> AssetEntry:
     file = Path(values["file"])
     values.setdefault("name", "_".join(file.stem.split()))
-    values.setdefault("display_name", " ".join(values["name"].replace("_", " ").split()) or values["name"])
-    values.setdefault("plural", regular_plural(values["display_name"]))
+    values.setdefault("display_name", " ".join(str(values["name"]).replace("_", " ").split()) or values["name"])
+    values.setdefault("plural", regular_plural(str(values["display_name"])))
     return AssetEntry(**values)
 
 
@@ -141,11 +146,8 @@ def _entry(item: Any, where: str, folder: Path) -> AssetEntry:
     if not isinstance(item, Mapping):
         raise InvalidInputError(f"{where} must be a mapping such as `file: mug.urdf`, got {item!r}")
     known = [field.name for field in fields(AssetEntry)]
-    for key in item:
-        if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.4)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise InvalidInputError(f"{where}: unknown key {key!r}{hint} Known: {', '.join(known)}.")
+    if unknown := [str(key) for key in item if key not in known]:
+        raise InvalidInputError(f"{where}: {unknown_name('key', unknown[0], known)}")
     if not isinstance(item.get("file"), str) or not item["file"]:
         raise InvalidInputError(f"{where} needs a `file`")
     where = f"{where} ({item['file']})"
@@ -154,33 +156,20 @@ def _entry(item: Any, where: str, folder: Path) -> AssetEntry:
         raise InvalidInputError(f"{where}: files of type {path.suffix!r} cannot be read; known: {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise InvalidInputError(f"{where}: there is no such file in {folder}")
-    values = {key: _value(key, value, where) for key, value in item.items() if value is not None}
+    texts = {key: value.strip() if isinstance(value, str) else value for key, value in item.items()}
+    values = {key: value for key, value in texts.items() if value is not None and value != ""}
     if "mass" in values and "density" in values:
         raise InvalidInputError(f"{where}: give mass or density, not both")
     if values.get("welded") and ("mass" in values or "density" in values):
         raise InvalidInputError(f"{where}: a welded asset has no mass; drop `mass` and `density`, or `welded`")
-    return _named(values)
-
-
-def _value(key: str, value: Any, where: str) -> Any:
-    if key in _TEXTS:
-        if not isinstance(value, str) or not value.strip():
-            raise InvalidInputError(f"{where}: {key} must be text, got {value!r}; put it in quotes")
-        return value.strip()
-    if key in _NUMBERS:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not math.isfinite(value) or value <= 0:
-            raise InvalidInputError(f"{where}: {key} must be a number above 0, got {value!r}")
-        return float(value)
-    if key in _CHOICES:
-        if value not in _CHOICES[key]:
-            raise InvalidInputError(f"{where}: {key} must be one of {', '.join(_CHOICES[key])}, got {value!r}")
-        return value
-    if key == "welded":
-        if not isinstance(value, bool):
-            raise InvalidInputError(f"{where}: welded must be true or false, got {value!r}")
-        return value
-    return _color(value, where)
+    if not isinstance(values.get("welded", True), bool):
+        raise InvalidInputError(f"{where}: welded must be true or false, got {values['welded']!r}")
+    if "color" in values:
+        values["color"] = _color(values["color"], where)
+    try:
+        return _named(values)
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{where}: {error}") from None
 
 
 def _color(value: Any, where: str) -> Color:
@@ -196,36 +185,28 @@ def _color(value: Any, where: str) -> Color:
     raise InvalidInputError(f"{where}: color must be [r, g, b] in 0..255 or '#rrggbb', got {value!r}")
 
 
-class Weight(NamedTuple):
-    """Mass properties of an asset, with remarks for the report."""
-
-    properties: MassProperties
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
-
-
 def weigh(
     given: MassProperties | None, parts: Sequence[ConvexPart], solid: MassProperties, entry: AssetEntry
-) -> Weight:
-    """Mass properties of an asset of these fine parts whose ``solid`` is given at 1 kg/m^3. Those ``given`` by the file
-    are kept where they are possible; an inertia of zeros is missing. A user's ``mass`` (kg) keeps the file's
-    distribution; a user's ``density`` (kg/m^3) fills the shape evenly.
+) -> tuple[MassProperties, tuple[str, ...], tuple[str, ...]]:
+    """Mass properties of an asset of these fine parts whose ``solid`` is given at 1 kg/m^3, with notes and warnings.
+    Those ``given`` by the file are kept where they are possible; an inertia of zeros is missing. A user's ``mass`` (kg)
+    keeps the file's distribution; a user's ``density`` (kg/m^3) fills the shape evenly.
     """
     mass = entry.mass
     if entry.density is not None:
-        return Weight(heavier(solid, entry.density), (), ())
+        return (heavier(solid, entry.density), (), ())
     if given is None or given.mass <= 0:
         known = "inertia computed from the shape"
         if mass is None:
             known, mass = f"mass and {known} at {DEFAULT_DENSITY:g} kg/m^3", DEFAULT_DENSITY * solid.mass
         why = "the file gives none" if given is None else f"the file gives a mass of {given.mass:g} kg"
-        return Weight(heavier(solid, mass / solid.mass), (f"{known}: {why}",), ())
+        return (heavier(solid, mass / solid.mass), (f"{known}: {why}",), ())
     if mass is None:
         found = given.mass / solid.mass
         if not _POSSIBLE[0] <= found <= _POSSIBLE[1]:
             reason = f"the file's {given.mass:g} kg would be {found:.3g} kg/m^3"
             text = f"mass and inertia recomputed at {DEFAULT_DENSITY:g} kg/m^3: {reason}"
-            return Weight(heavier(solid, DEFAULT_DENSITY), (), (text,))
+            return (heavier(solid, DEFAULT_DENSITY), (), (text,))
         mass = given.mass
     inertia, even = given.inertia * (mass / given.mass), heavier(solid, mass / solid.mass)
     notes: tuple[str, ...] = ()
@@ -233,8 +214,11 @@ def weigh(
         inertia, notes = even.inertia, ("inertia computed from the shape: the file gives none",)
     wrong = why_impossible(inertia, given.center_of_mass, parts, even)
     if wrong:
-        return Weight(even, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
-    return Weight(MassProperties(mass, given.center_of_mass, 0.5 * (inertia + inertia.T)), notes, ())
+        return (even, (), (f"centre of mass and inertia recomputed from the shape: {wrong}",))
+    inertia = 0.5 * (inertia + inertia.T)
+    low, middle, high = np.linalg.eigvalsh(inertia)
+    inertia += max(0.0, high * (1.0 + 1e-9) - low - middle) * np.eye(3)  # MuJoCo refuses a plate by a rounding
+    return (MassProperties(mass, given.center_of_mass, inertia), notes, ())
 
 
 def why_impossible(inertia: Array, center: Array, parts: Sequence[ConvexPart], computed: MassProperties) -> str:
@@ -340,17 +324,21 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     size = _diagonal(shapes)
     if not _SMALL <= size <= _LARGE:
         warnings.append(f"it is {size:.3g} m large; if the file is not in metres, set `scale`")
-    parts, solid = _collide(shapes, entry, size, path, notes, warnings)
+    pieces = _collide(shapes, entry, size, path, notes, warnings)
+    parts, solid = [part for piece in pieces for part in piece.parts], merged_inertial([p.solid for p in pieces])
     static = model.static is True if entry.welded is None else entry.welded
     if entry.welded is None and (entry.mass is not None or entry.density is not None):
         static = False
-    given = merged_inertial(model.inertials) if model.inertials else None
-    weight = weigh(given, parts, solid, entry)
-    properties = mass_properties(parts, 0.0) if static else weight.properties
-    if not static:
-        notes += weight.notes
-        warnings += weight.warnings
-    visual = join(*(mesh for shape in model.visuals or shapes for mesh in visual_of(shape, entry.color)))
+    if static and model.faults:
+        raise CorruptFileError("; ".join(model.faults))
+    notes += model.faults
+    properties, remarks, faults = weigh(_given(model, {}), parts, solid, entry)
+    if static:
+        properties, remarks, faults = mass_properties(parts, 0.0), (), ()
+    notes += remarks
+    warnings += faults
+    drawn = [(shape.link, visual_of(shape, entry.color)) for shape in model.visuals or shapes]
+    visual = join(*(mesh for _, meshes in drawn for mesh in meshes))
     meshes = [shape for shape in (*model.visuals, *shapes) if shape.kind == "mesh"]
     notes += dict.fromkeys(
         note for shape in meshes for mesh in meshes_of(shape) for note in mesh.metadata.get("notes", ())
@@ -362,6 +350,10 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
     fine = tuple(_shifted(part, shift) for part in parts)
     if len(visual.faces) > _MANY_TRIANGLES:
         notes.append(f"{len(visual.faces)} triangles to draw; pictures will be slow")
+    joints, bodies = _articulate(model, pieces, drawn, entry, shift, notes, warnings if static else [])
+    if joints:
+        where = "frozen at zero, and kept in exports" if static else "frozen at zero"
+        notes.append(f"movable joints {where}: {', '.join(joint.name for joint in joints)}")
     asset = Asset(
         name=entry.name,
         display_name=entry.display_name,
@@ -374,11 +366,72 @@ def build_asset(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
         coarse=fine if len(fine) == 1 else (enclosing_hull(fine),),
         color=entry.color or (128, 128, 128),
         static=static,
+        joints=joints,
+        bodies=bodies,
     )
     x, y, z = (shift + 0.0).tolist()
     density = 0.0 if static else properties.mass / solid.mass
-    remarks = tuple(notes), tuple(warnings)
-    return asset, AssetReport(entry.name, path, properties.mass, density, len(fine), (x, y, z), *remarks)
+    said = tuple(notes), tuple(warnings)
+    return asset, AssetReport(entry.name, path, properties.mass, density, len(fine), (x, y, z), *said)
+
+
+def _given(model: Model, rows: Mapping[int, int], row: int = 0) -> MassProperties | None:
+    """What the file gives for the body that has this row, by the joints of its links; by default all is one body."""
+    own = [inertial for link, inertial in model.inertials if rows.get(link, 0) == row]
+    return merged_inertial(own) if own else None
+
+
+def _articulate(
+    model: Model,
+    pieces: Sequence[_Piece],
+    drawn: Sequence[tuple[int, list[trimesh.Trimesh]]],
+    entry: AssetEntry,
+    shift: Array,
+    notes: list[str],
+    warnings: list[str],
+) -> tuple[tuple[Joint, ...], tuple[Asset, ...]]:
+    """The joints whose links can be seen and touched, and the bodies that they connect; other links stay with what they
+    hang on.
+    """
+    solid = {piece.link for piece in pieces} & {link for link, _ in drawn}
+    rows, kept, has_base = {0: 0}, list[int](), 0 in solid
+    for index, joint in enumerate(model.joints, start=1):
+        rows[index] = parent = rows[joint.parent]
+        if index in solid and (parent or has_base):
+            kept.append(index)
+            rows[index] = len(kept)
+        else:
+            has_base |= index in solid
+            notes.append(f"movable joint frozen at zero: {joint.name} (it joins what has no shape)")
+    if not kept:
+        return (), ()
+    names = identifiers(model.joints[index - 1].link for index in kept)
+    titles = identifiers(model.joints[index - 1].name for index in kept)
+    joints, bodies, frames = list[Joint](), list[Asset](), [np.eye(4)]
+    for row, index in enumerate([0, *kept]):
+        if row:
+            joint = model.joints[index - 1]
+            frames.append(joint.pose)
+            parent, link = rows[joint.parent], names[joint.link]
+            pose = np.linalg.inv(frames[parent]) @ joint.pose
+            pose[:3, 3] += 0.0 if parent else shift
+            link += "_link" * (link in (identifier(entry.name), "joints"))  # names that exports give
+            joints.append(dataclasses.replace(joint, name=titles[joint.name], link=link, parent=parent, pose=pose))
+        back: Any = np.linalg.inv(frames[row]) if row else pose_of(shift, np.eye(3))
+        own = [piece for piece in pieces if rows[piece.link] == row]
+        parts = [part for piece in own for part in piece.parts]
+        even = merged_inertial([piece.solid for piece in own])
+        weight, _, faults = weigh(_given(model, rows, row), parts, even, dataclasses.replace(entry, mass=None))
+        name = joints[-1].link if row else "base"
+        warnings += [f"link {name!r}: {text}" for text in faults if row]
+        mass, center, inertia = moved_inertial(back, weight)
+        look = join(*(mesh for link, meshes in drawn if rows[link] == row for mesh in meshes))
+        look = moved(look, back[:3, :3], back[:3, 3])
+        turned = [ConvexPart(part.vertices @ back[:3, :3].T, part.faces) for part in parts]
+        fine = tuple(_shifted(part, back[:3, 3]) for part in turned)
+        looks: dict[str, Any] = {"visual": look, "fine": fine, "coarse": fine, "color": entry.color or (128, 128, 128)}
+        bodies.append(Asset(f"{entry.name}/{name}", name, name, mass, center, inertia, static=not row, **looks))
+    return tuple(joints), tuple(bodies)
 
 
 def _read(path: Path) -> Model:
@@ -401,14 +454,25 @@ def _scaled(model: Model, entry: AssetEntry) -> Model:
         return dataclasses.replace(old, pose=pose, size=tuple(scale * s for s in old.size))
 
     inertials = tuple(
-        MassProperties(i.mass * scale**3, scale * turn @ i.center_of_mass, scale**5 * turn @ i.inertia @ turn.T)
-        for i in model.inertials
+        (k, MassProperties(i.mass * scale**3, scale * turn @ i.center_of_mass, scale**5 * turn @ i.inertia @ turn.T))
+        for k, i in model.inertials
+    )
+    far = {"prismatic": scale, "revolute": 1.0}
+    joints = tuple(
+        dataclasses.replace(
+            j,
+            pose=pose_of(scale * turn @ j.pose[:3, 3], turn @ j.pose[:3, :3]),
+            limits=(j.limits[0] * far[j.kind], j.limits[1] * far[j.kind]),
+        )
+        for j in model.joints
     )
     notes = model.notes
-    if scale != 1.0 and any(i.mass > 0 for i in model.inertials) and entry.mass is None and entry.density is None:
+    if scale != 1.0 and any(i.mass > 0 for _, i in model.inertials) and entry.mass is None and entry.density is None:
         notes = (*notes, f"mass scaled by {scale:g} cubed")
     visuals, collisions = (tuple(map(shape, some)) for some in (model.visuals, model.collisions))
-    return Model(visuals, collisions, inertials, model.static, notes)
+    return dataclasses.replace(
+        model, visuals=visuals, collisions=collisions, inertials=inertials, notes=notes, joints=joints
+    )
 
 
 def _upright(up: Axis) -> Array:
@@ -422,28 +486,26 @@ def _upright(up: Axis) -> Array:
     return quarter[up] if up in quarter else quarter["-z"] @ quarter[up[1:]]
 
 
+class _Piece(NamedTuple):
+    """A shape that collides."""
+
+    link: int  # as of the shape
+    parts: list[ConvexPart]
+    solid: MassProperties  # at 1 kg/m^3
+
+
 def _diagonal(shapes: Sequence[Shape]) -> float:
     """Length (m) of the diagonal of the bounding box of all shapes."""
-    points = []
-    for shape in shapes:
-        if shape.kind == "mesh":
-            points += [np.asarray(mesh.vertices) for mesh in meshes_of(shape)]
-        else:
-            reach = sum(shape.size) if shape.kind == "capsule" else max(shape.size)
-            half = np.array(shape.size) / 2 if shape.kind == "box" else np.full(3, reach)
-            corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
-            points.append(corners @ shape.pose[:3, :3].T + shape.pose[:3, 3])
-    cloud = np.concatenate(points)
-    return float(np.linalg.norm(cloud.max(axis=0) - cloud.min(axis=0)))
+    meshes = [mesh for s in shapes for mesh in (meshes_of(s) if s.kind == "mesh" else visual_of(s, None))]
+    return float(np.linalg.norm(np.ptp(np.concatenate([mesh.bounds for mesh in meshes]), axis=0)))
 
 
 def _collide(
     shapes: Sequence[Shape], entry: AssetEntry, size: float, path: Path, notes: list[str], warnings: list[str]
-) -> tuple[list[ConvexPart], MassProperties]:
-    """Fine parts of all shapes and their solid at 1 kg/m^3; adds remarks to ``notes`` and ``warnings``."""
+) -> list[_Piece]:
+    """Fine parts and solids of all shapes; adds remarks to ``notes`` and ``warnings``."""
     tolerance = min(_CONVEX * size, _MAX_CONVEX)
-    parts: list[ConvexPart] = []
-    solids: list[MassProperties] = []
+    pieces: list[_Piece] = []
     repeated = 0
     seen: set[bytes] = set()
     for shape in shapes:
@@ -453,11 +515,11 @@ def _collide(
             repeated += 1
             continue
         seen.add(key)
-        parts += found.parts
-        solids.append(found.solid)
+        pieces += [_Piece(shape.link, found.parts, found.solid)] if found.parts else []
         seconds_left()
         notes += [note for note in found.notes if note not in notes]
         warnings += [warning for warning in found.warnings if warning not in warnings]
+    parts = [part for piece in pieces for part in piece.parts]
     if not parts:
         raise InvalidInputError(f"{path} spans no volume: all corners of its collision geometry lie in one plane")
     if repeated:
@@ -468,7 +530,7 @@ def _collide(
         notes.append(f"{thin} of {len(parts)} parts thinner than 3 mm (the thinnest {1e3 * min(widths):.2g} mm)")
     if len(parts) > _MANY_PARTS:
         notes.append(f"{len(parts)} parts; physics will be slow, a larger `concavity` gives fewer")
-    return parts, merged_inertial(solids)
+    return pieces
 
 
 def _shift(parts: Sequence[ConvexPart], entry: AssetEntry, visual: trimesh.Trimesh | None) -> Array:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import re
+import struct
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,9 +22,9 @@ from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
+from scene_envs.assets.base import Joint
 from scene_envs.assets.importing.limits import check_file, check_triangles, gltf_header, seconds_left
 from scene_envs.assets.shapes import MassProperties
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError, SceneEnvsError
@@ -73,6 +76,7 @@ class Shape:
     part: tuple[str, bool] | None = None  # the one object of a mesh file, and whether its box is centred at the origin
     density: float | None = None  # kg/m^3, given by the model
     surface: trimesh.Trimesh | None = None  # the mesh itself, where it is no file of its own
+    link: int = 0  # number of the joint of the model that moves it, counted from 1; 0 for what does not move
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +85,11 @@ class Model:
 
     visuals: tuple[Shape, ...]  # shapes to draw
     collisions: tuple[Shape, ...]  # shapes for collisions
-    inertials: tuple[MassProperties, ...] = ()  # inertials of the links that have one
+    inertials: tuple[tuple[int, MassProperties], ...] = ()  # of the links that have one, with their joint as of shapes
     static: bool | None = None  # whether the model is fixed to the world; None when the file does not say
     notes: tuple[str, ...] = field(default=())  # choices of the reader that the file may not intend
+    joints: tuple[Joint, ...] = ()  # joints that move, each after its parent, with poses in the frame of the model
+    faults: tuple[str, ...] = ()  # what is wrong with joints, which are frozen
 
 
 def pose_of(translation: Array, rotation: Array) -> Array:
@@ -91,11 +97,6 @@ def pose_of(translation: Array, rotation: Array) -> Array:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, translation
     return pose
-
-
-def from_roll_pitch_yaw(angles: Array) -> Array:
-    """(3, 3) rotation of URDF and SDF: about the fixed axes x, then y, then z; (3,) rad."""
-    return np.asarray(Rotation.from_euler("xyz", angles).as_matrix())
 
 
 def moved_inertial(pose: Array, inertial: MassProperties) -> MassProperties:
@@ -163,7 +164,7 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     if len(pieces) < len(found):
         content.notes.append(f"{len(found) - len(pieces)} object(s) of points or lines left out")
     if not pieces:
-        raise CorruptFileError(f"{path} holds no triangles")
+        raise CorruptFileError("; ".join([f"{path} holds no triangles", *dict.fromkeys(content.notes)]))
     for mesh in pieces:
         _check_mesh(mesh, path)
     check_triangles(path, sum(len(mesh.faces) for mesh in pieces))
@@ -186,6 +187,7 @@ class _Content:
         self.axes, self.upright = np.eye(3), np.eye(3)  # to the axes and unit of its meshes, and from these to z up
         self.notes: list[str] = []  # what is not loaded
         self.scales: list[float] = []  # of the geometries, in the order of trimesh; 1 where there are fewer
+        self.joints: list[list[int]] = []  # nodes that move the skins of a glTF
         self.names: dict[str, str] = {}  # of the objects of the file, by what trimesh begins their names with
 
     def load(self) -> Any:
@@ -194,8 +196,19 @@ class _Content:
 
         options: dict[str, Any] = {"obj": {"split_objects": True}, "dae": {"ignore_broken": False}}.get(self.type, {})
         resolver = trimesh.resolvers.FilePathResolver(str(self.path))
+        if self.type in ("glb", "gltf"):
+            parts = getattr(trimesh.exchange.gltf, f"load_{self.type}")(BytesIO(self.data), resolver)
+            for mesh, scale in zip(parts["geometry"].values(), self.scales, strict=False):
+                mesh["vertices"] = mesh["vertices"] * scale
+            _pose_gltf(parts, self.joints)
+            return trimesh.load_scene(parts)
         try:
-            with patch("collada.polylist.Polylist.triangleset", _triangleset) if self.type == "dae" else nullcontext():
+            with ExitStack() as patches:
+                if self.type == "dae":
+                    import collada
+
+                    patches.enter_context(patch("collada.polylist.Polylist.triangleset", _triangleset))
+                    patches.enter_context(patch("collada.Collada", partial(_pose_dae, collada.Collada)))
                 scene = trimesh.load_scene(BytesIO(self.data), self.type, resolver, process=False, **options)
         except Exception as error:
             if self.type != "dae" or not _drop_looks(self, error):
@@ -203,8 +216,6 @@ class _Content:
             return self.load()
         for geometry in scene.geometry.values() if self.type == "ply" else ():
             _cut_again(geometry)
-        for geometry, scale in zip(scene.geometry.values(), self.scales, strict=False):
-            geometry.vertices = geometry.vertices * scale
         return scene
 
     def names_of(self, name: str) -> set[str]:
@@ -280,6 +291,7 @@ def _prepare_obj(content: _Content) -> None:
     for library in [content.path.parent / name for name in libraries[:1]]:
         materials = decode_text(library.read_bytes()) if library.is_file() else ""
         content.expect(re.findall(r"^\s*map_Kd\s+(.+?)\s*$", materials, re.MULTILINE | re.IGNORECASE), "texture")
+    content.notes += [f"its file {name!r} is not read" for name in re.findall(r"^call (\S+)", text, re.MULTILINE)]
     if re.search(r"^(?:l|p|curv2?|surf) ", text, re.MULTILINE):
         content.notes.append("its points, lines and curves are left out")
     if re.search(r"^f(?: +[^\s#]+){4}|^f[^\n]*[ /]-", text, re.MULTILINE):
@@ -316,7 +328,7 @@ def _cut_faces(lines: list[str], path: Path) -> str:
 
 
 def _prepare_dae(content: _Content) -> None:
-    """Unit and up axis; skins and lines left out, which trimesh does not read, and cameras, lights and animations."""
+    """Unit and up axis; lines left out, which trimesh does not read, and cameras, lights and animations."""
     root = _parsed(content.data, content.path)
     if (unit := root.find("asset/unit")) is not None:
         content.axes = np.eye(3) * positive(unit.get("meter", "1"), 1, content.path, "unit of the asset")[0]
@@ -327,6 +339,8 @@ def _prepare_dae(content: _Content) -> None:
     content.expect([image.removeprefix("file://") for image in images], "texture")
     content.names |= {geometry.get("id", ""): geometry.get("name", "") for geometry in root.iter("geometry")}
     unused, named = FORMATS["COLLADA"].values()
+    unused = unused if root.find(".//instance_controller") is not None else [*unused, "controllers"]
+    content.notes += ["its morph targets are not applied"] * (root.find(".//morph") is not None)
     for parent in list(root.iter()):
         for child in list(parent):
             kind = child.tag.removeprefix("instance_").removeprefix("library_")
@@ -344,6 +358,63 @@ def _triangleset(polygons: Any) -> Any:
     return TriangleSet(polygons.sources, polygons.material, polygons.index[cut].ravel(), polygons.xmlnode)
 
 
+def _pose_dae(load: Any, *args: Any, **kwargs: Any) -> Any:
+    """A COLLADA document whose skinned meshes have the shape that their joints give them; ``load`` reads it."""
+    from collada import scene
+
+    document, places, skinned = load(*args, **kwargs), {}, []
+
+    def visit(children: list[Any], base: Array, above: tuple[str, ...]) -> None:
+        for node in [*children]:
+            if isinstance(node, scene.ControllerNode):
+                children.remove(node)
+                if hasattr(node.controller, "joint_matrices"):
+                    skinned.append(node)
+                else:
+                    children.append(scene.GeometryNode(node.controller.source_geometry, node.materials))
+            elif isinstance(node, scene.Node):
+                place, roots = base @ node.matrix, (*above, node.id)
+                names = [node.xmlnode.get(key) for key in ("sid", "id", "name")]
+                places.update({(root, name): place for root in roots for name in names if (root, name) not in places})
+                visit(node.children, place, roots)
+
+    visit(document.scene.nodes, np.eye(4), ("",))
+    for node in skinned:
+        skin, matrices = node.controller, [node.controller.bind_shape_matrix]
+        roots = [(element.text or "").strip()[1:] for element in node.xmlnode.findall(document.tag("skeleton"))]
+        for joint in skin.weight_joints:
+            found = [places[root, joint] for root in (*roots, "") if (root, joint) in places]
+            if not found:
+                raise ValueError(f"the joint '{joint}' of the skin {skin.id!r} is not in its scene")
+            matrices.append(found[0] @ skin.joint_matrices[joint] @ skin.bind_shape_matrix)
+        joints, weights = np.concatenate(skin.joint_index), skin.weights.data[np.concatenate(skin.weight_index)]
+        rows = np.repeat(np.arange(len(skin.vcounts)), skin.vcounts)
+        geometry = copy.copy(skin.geometry)
+        geometry.primitives = [copy.copy(primitive) for primitive in geometry.primitives]
+        for primitive in geometry.primitives:
+            source = copy.copy(primitive.sources["VERTEX"][0][4])
+            source.data = _skinned(source.data, rows, joints + 1, weights.ravel(), np.array(matrices, dtype=float))
+            primitive._vertex = source.data
+            primitive.sources = {**primitive.sources, "VERTEX": [(*primitive.sources["VERTEX"][0][:4], source)]}
+        document.scene.nodes.append(scene.GeometryNode(geometry, node.materials))
+    return document
+
+
+def _skinned(points: Array, rows: Indices, joints: Indices, weights: Array, matrices: Array) -> Array:
+    """Points (V, 3) moved by the mean of ``matrices`` (J, 4, 4), with a row, a joint and a weight for each influence;
+    those without any are moved by the first.
+    """
+    total = np.bincount(rows, weights, len(points))
+    free = np.flatnonzero(total == 0)
+    rows, joints, weights = np.append(rows, free), np.append(joints, 0 * free), np.append(weights, 1.0 + 0 * free)
+    moved = np.zeros((len(points), 3))
+    for joint in np.unique(joints):
+        at = np.flatnonzero((joints == joint) & (weights != 0))
+        turned = points[rows[at]] @ matrices[joint, :3, :3].T + matrices[joint, :3, 3]
+        np.add.at(moved, rows[at], weights[at, None] * turned)
+    return moved / np.where(total == 0, 1.0, total)[:, None]
+
+
 def _drop_looks(content: _Content, error: Exception) -> bool:
     """Leave out the materials of a COLLADA file, which pycollada cannot read; False when there are none."""
     root = _parsed(content.data, content.path)
@@ -358,17 +429,40 @@ def _drop_looks(content: _Content, error: Exception) -> bool:
 
 
 def _prepare_off(content: _Content) -> None:
-    """The same mesh as an OBJ."""
+    """The same mesh as an OBJ; InvalidInputError for points of other dimensions than three."""
     from trimesh.util import comment_strip, decode_text
 
-    lines = comment_strip(decode_text(content.data)).split("OFF", 1)[-1].split("\n")
-    rows = [line.split() for line in lines if line.strip()]
+    kind, _, text = comment_strip(decode_text(content.data)).rpartition("OFF")
+    if {"4", "n"} & {*kind}:
+        raise InvalidInputError(
+            f"{content.path} is a {kind.strip()}OFF, whose points are not in space; export it as OFF"
+        )
+    rows = [line.split() for line in text.split("\n") if line.strip()]
     vertices, faces = int(rows[0][0]), int(rows[0][1])
-    text = ["v " + " ".join(row[:3]) for row in rows[1 : vertices + 1]]
-    for row in rows[vertices + 1 : vertices + faces + 1]:
-        text.append("f " + " ".join(str(int(word) + 1) for word in row[1 : int(row[0]) + 1]))
-    content.type, content.data = "obj", "\n".join(text).encode()
+    points, polygons = rows[1 : vertices + 1], rows[vertices + 1 : vertices + faces + 1]
+    lines = ["v " + " ".join(row[:3]) for row in points]
+    lines += ["f " + " ".join(str(int(word) + 1) for word in row[1 : int(row[0]) + 1]) for row in polygons]
+    if any(len(row) > 3 for row in points) or any(len(row) > int(row[0]) + 1 for row in polygons):
+        content.notes.append("its colours, normals and texture coordinates are not read")
+    content.type, content.data = "obj", "\n".join(lines).encode()
     _prepare_obj(content)
+
+
+def _prepare_stl(content: _Content) -> None:
+    """Colours are not loaded: some programs write them into the header or behind each triangle."""
+    if len(content.data) == 84 + 50 * int.from_bytes(content.data[80:84], "little"):  # a binary one
+        rows = np.frombuffer(content.data[84:], np.uint8).reshape(-1, 50)
+        content.notes += ["its colours are not read"] * bool(rows[:, 48:].any() or b"COLOR=" in content.data[:80])
+
+
+def _prepare_ply(content: _Content) -> None:
+    """What is not loaded: elements besides vertices and faces, and textures that are not there."""
+    head = content.data.partition(b"end_header")[0].decode("ascii", "replace")
+    content.expect(re.findall(r"^comment TextureFile (.+?)\s*$", head, re.MULTILINE), "texture")
+    if content.notes:
+        content.data = content.data.replace(b"TextureFile", b"texture")
+    names = re.findall(r"^element\s+(?!vertex\s|face\s)(\w+)", head, re.MULTILINE)
+    content.notes += [f"its elements {name!r} are left out" for name in names]
 
 
 def _cut_again(mesh: Any) -> None:
@@ -432,6 +526,8 @@ def _prepare_gltf(content: _Content) -> None:
     lacking += ["sparse accessors" for accessor in accessors if "sparse" in accessor]
     lacking += ["a mesh below a camera" for node in nodes if "camera" in node and {"mesh", "children"} & {*node}]
     lacking += ["no scene"] * (not header.get("scenes"))
+    for attributes in (p["attributes"] for n in nodes if "skin" in n for p in meshes[n["mesh"]]["primitives"]):
+        lacking += ["a skin without joints or weights"] * (not {"JOINTS_0", "WEIGHTS_0"} <= {*attributes})
     for primitive in primitives:
         position = accessors[primitive["attributes"]["POSITION"]]
         if "bufferView" not in position and "sparse" not in position:
@@ -447,7 +543,7 @@ def _prepare_gltf(content: _Content) -> None:
         )
     used = {n for n in header.get("extensionsUsed", ()) if n in lost or not n.startswith(looks)}
     own = {n for some in (*nodes, *primitives, *header.get("materials", ())) for n in some.get("extensions", ())}
-    used |= {n for n in own if n in lost or not n.startswith(looks)} | {"animations", "skins"} & {*header}
+    used |= {n for n in own if n in lost or not n.startswith(looks)} | {"animations"} & {*header}
     used |= {"COLOR_0 beside a material" for p in primitives if "COLOR_0" in p["attributes"] and "material" in p}
     colors = [m.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}) for m in header.get("materials", ())]
     used |= {f"texture by TEXCOORD_{image['texCoord']}" for image in colors if image.get("texCoord")}
@@ -461,9 +557,51 @@ def _prepare_gltf(content: _Content) -> None:
     if apart := len(roots - {*header["scenes"][header.get("scene", 0)].get("nodes", ())}):
         content.notes.append(f"{apart} node(s) outside its scene are left out")
 
+    if not (skins := header.get("skins")):
+        return
+    for index, node in enumerate(nodes):  # what trimesh keeps of them
+        node["extras"] = {"index": index, "skin": node.get("skin")}
+    for attributes in (primitive["attributes"] for primitive in primitives):
+        attributes |= {f"_{name}": at for name, at in attributes.items() if name.startswith(("JOINTS_", "WEIGHTS_"))}
+        attributes |= {f"_{i}": s["inverseBindMatrices"] for i, s in enumerate(skins) if "inverseBindMatrices" in s}
+    content.joints = [skin.get("joints", []) for skin in skins]
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content.data[20 + int.from_bytes(content.data[12:16], "little") :]
+    head = struct.pack("<4s3I4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON")
+    content.data = head + text + rest if content.type == "glb" else text
+
+
+def _pose_gltf(parts: dict[str, Any], skins: list[list[int]]) -> None:
+    """Give the meshes with a skin, of the parts of a scene, the shape that their joints give them."""
+    base = parts["base_frame"]
+    frames, nodes = {base: np.eye(4)}, {}
+    for edge in parts["graph"]:  # the parents of a frame come before it
+        frames[edge["frame_to"]] = frames[edge["frame_from"]] @ edge["matrix"]
+        nodes[edge.get("metadata", {}).get("index")] = frames[edge["frame_to"]]
+    for edge in [edge for edge in parts["graph"] if skins and "geometry" in edge]:
+        if (skin := edge["metadata"]["skin"]) is None:
+            continue
+        if lost := {*skins[skin]} - {*nodes}:
+            raise ValueError(f"the nodes {sorted(lost)}, joints of a skin, are not in its scene")
+        old = edge.pop("geometry")
+        mesh, new = {**parts["geometry"][old], "vertex_normals": None}, f"{old}_at the joints of {edge['frame_to']}"
+        given = mesh.pop("vertex_attributes")
+        joints, weights = (
+            np.concatenate([given[key] for key in sorted(given) if key.startswith(kind)], axis=1)
+            for kind in ("_JOINTS_", "_WEIGHTS_")
+        )
+        binds = given.get(f"_{skin}", np.eye(4)).swapaxes(-1, -2)  # matrices of glTF have their columns first
+        matrices = np.array([nodes[joint] for joint in skins[skin]]) @ binds
+        rows = np.repeat(np.arange(len(joints)), joints.shape[1])
+        mesh["vertices"] = _skinned(mesh["vertices"], rows, joints.ravel(), weights.ravel(), matrices)
+        parts["geometry"][new] = mesh
+        parts["graph"].append({"frame_from": base, "frame_to": new, "matrix": np.eye(4), "geometry": new})
+
 
 _PREPARED = {
-    ".obj": _prepare_obj, ".off": _prepare_off, ".dae": _prepare_dae, ".glb": _prepare_gltf, ".gltf": _prepare_gltf
+    ".obj": _prepare_obj, ".off": _prepare_off, ".dae": _prepare_dae, ".glb": _prepare_gltf, ".gltf": _prepare_gltf,
+    ".stl": _prepare_stl, ".ply": _prepare_ply,
 }  # fmt: skip
 
 

@@ -7,13 +7,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
-from xml.etree.ElementTree import Element
+from typing import Any, Literal
+from xml.etree.ElementTree import Element, fromstring
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
+from scene_envs.assets.base import Joint
 from scene_envs.assets.importing.limits import check_file, check_triangles
 from scene_envs.assets.importing.mesh_files import (
     FORMATS,
@@ -24,7 +25,6 @@ from scene_envs.assets.importing.mesh_files import (
     color_of,
     cut_polygons,
     find_mesh,
-    from_roll_pitch_yaw,
     heavier,
     merged_inertial,
     moved_inertial,
@@ -38,13 +38,8 @@ from scene_envs.assets.shapes import MassProperties
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 
 _Colors = Mapping[str, Color | None]
-_ZERO = (0.0, 0.0, 0.0)
 _TO_WORLD = "a joint holds it at `world`"
-_LEFT_OUT = ("nu actuators", "nsensor sensors", "ntendon tendons", "neq constraints", "nflex flexes", "nskin skins",
-             "nplugin plugins", "ngravcomp gravcomp")  # fmt: skip
-"""The sizes of a model in MuJoCo that count what an asset does not have."""
-_NOT_OF_USD = ("kinematicEnabled", "velocity", "angularVelocity", "restitution")
-"""Properties of UsdPhysics that an asset does not have."""
+_OF_JOINTS = ("limit", "dynamics", "mimic")
 
 
 def _unread(root: Element, kind: str) -> list[str]:
@@ -89,7 +84,50 @@ class _Reading:
     def __init__(self, root: Element, kind: str, path: Path) -> None:
         self.kind, self.path, self.notes = kind, path, _unread(root, kind)
         self.shapes: dict[str, list[Shape]] = {"visual": [], "collision": []}
-        self.inertials: list[MassProperties] = []
+        self.inertials: list[tuple[int, MassProperties]] = []
+        self.frozen: list[str] = []
+        self.faults: list[str] = []
+        self.joints: list[Joint] = []
+        self.rows: dict[str, int] = {}  # of links that joints move
+
+    def joint(self, element: Element, link: str, pose: Array, turn: Array) -> Joint | None:
+        """The joint that moves ``link``, with its pose (4, 4) in the model and the rotation (3, 3) of its axis to the
+        frame of this pose; None for a fixed one, and for one that is frozen and therefore noted.
+        """
+        kind, name, is_urdf = element.get("type", ""), element.get("name", "?"), self.kind == "URDF"
+        axis, where = element.find("axis"), f"joint {name!r}"
+        owner = element if is_urdf else axis
+        limit, dynamics, mimic = (None if owner is None else owner.find(tag) for tag in _OF_JOINTS)
+        if kind not in ("revolute", "continuous", "prismatic") or mimic is not None:
+            self.frozen += [] if kind == "fixed" else [f"{name} ({kind if mimic is None else 'mimic'})"]
+            return None
+
+        def number(key: str, where_from: Element | None, default: float) -> float:
+            text = _text(where_from, key) or ""
+            plain = numbers(None if "inf" in text else text, 1, self.path, f"{key} of {where}", (default,))[0]
+            value = float(text) if text.strip(" +-") == "inf" else float(plain)
+            return value if abs(value) < 1e16 else float(np.copysign(np.inf, value))  # as SDFormat says
+
+        default = (1.0, 0.0, 0.0) if is_urdf else (0.0, 0.0, 1.0)
+        vector = numbers(_text(axis, "xyz"), 3, self.path, f"axis of {where}", default)
+        far = 0.0 if is_urdf and kind != "continuous" else np.inf
+        ends = None if kind == "continuous" else limit
+        low, high = number("lower", ends, 0.0 - far), number("upper", ends, far)
+        rubs = number("damping", dynamics, 0.0), number("friction", dynamics, 0.0)
+        length = float(np.linalg.norm(vector))
+        if is_urdf and limit is None and kind != "continuous":
+            fault = f"is {kind} and has no <limit>; give it lower and upper, or make it continuous or fixed"
+        elif low > high:
+            fault = f"has a lower limit of {low:g} above its upper one of {high:g}; exchange them"
+        elif not length or min(rubs) < 0:
+            fault = f"has the axis {vector.tolist()}, damping and friction {rubs}; 0 0 1, 0 and 0 would do"
+        else:
+            moves: Literal["prismatic", "revolute"] = "prismatic" if kind == "prismatic" else "revolute"
+            found = Joint(name, link, 0, moves, pose, turn @ vector / length, (low, high), *rubs)
+            self.frozen += _why_still(found)
+            return None if _why_still(found) else found
+        self.faults.append(f"{self.path}: {where} {fault}")
+        return None
 
     def add(self, link: Element, place: Callable[[Element, str], Array], materials: _Colors) -> list[Shape]:
         """Read the shapes of a link, whose poses in the model frame ``place`` gives; returns its collisions."""
@@ -101,17 +139,40 @@ class _Reading:
                 if isinstance(shape, str):
                     self.notes.append(f"{where} {shape}, which is left out")
                 else:
-                    shapes.append(shape)
+                    shapes.append(replace(shape, link=self.rows.get(link.get("name", ""), 0)))
         return self.shapes["collision"][before:]
 
-    def model(self, movable: list[str], welded: str) -> Model:
+    def model(self, welded: str) -> Model:
         """The model, with the reason why it is welded, "" where it is not."""
-        if movable:
-            self.notes.append(f"movable joints frozen at zero: {', '.join(movable)}")
+        if self.frozen:
+            self.notes.append(f"movable joints frozen at zero: {', '.join(self.frozen)}")
         if welded:
             self.notes.append(f"{welded}: it is welded (`welded: false` makes it free)")
         visuals, collisions = map(tuple, self.shapes.values())
-        return Model(visuals, collisions, tuple(self.inertials), bool(welded) or None, tuple(self.notes))
+        joints = tuple(self.joints), tuple(self.faults)
+        return Model(visuals, collisions, tuple(self.inertials), bool(welded) or None, tuple(self.notes), *joints)
+
+
+def _numbered(holding: Mapping[Any, tuple[Any, Joint | None]]) -> tuple[dict[Any, int], list[Joint], list[str]]:
+    """Number of each link, the joints in this order, and the names of those in loops, from what holds each link."""
+    left, rows, joints = dict(holding), dict[Any, int](), list[Joint]()
+    while ready := [link for link in left if left[link][0] not in left]:
+        for link in ready:
+            parent, joint = left.pop(link)
+            rows[link] = rows.get(parent, 0)
+            if joint is not None:
+                joints.append(replace(joint, parent=rows[link]))
+                rows[link] = len(joints)
+    return rows, joints, [f"{joint.name} (in a loop)" for _, joint in left.values() if joint is not None]
+
+
+def _why_still(joint: Joint) -> list[str]:
+    """The name of a joint with the reason why its limits freeze it; nothing for one that moves."""
+    low, high = joint.limits
+    if np.isinf(joint.limits).sum() == 1 or (np.isinf(low) and joint.kind == "prismatic"):
+        return [f"{joint.name} ({joint.kind}, without a lower and an upper limit)"]
+    way = f"{joint.name} (its limits are {low:g} to {high:g}" + (")" if low <= 0 <= high else ", without 0)")
+    return [] if low <= 0.0 <= high and low < high else [way]
 
 
 def read_sdf(path: Path) -> Model:
@@ -121,6 +182,23 @@ def read_sdf(path: Path) -> Model:
     root = read_xml(path)
     model = _only_model(root, path)
     links, frames, reading = _links(model, path), _sdf_frames(model, path), _Reading(root, "SDF", path)
+    ends = {
+        joint: [(joint.findtext(end) or "").strip() for end in ("parent", "child")]
+        for joint in [*model.findall("joint"), *root.findall("world/joint")]
+    }
+    for name in {name for joint in model.findall("joint") for name in ends[joint]} - {"world"}:
+        frames.pose(name)
+    children = [child for _, child in ends.values()]
+    static = _flag(model.findtext("static"))
+    holding: dict[str, tuple[str, Joint | None]] = {}
+    for joint, (parent, child) in ends.items():
+        why = "the file says static" if static else "in a loop" if children.count(child) > 1 else ""
+        if why := why or ("" if child in links else f"{child} is no link"):
+            reading.frozen += [] if joint.get("type") == "fixed" else [f"{joint.get('name', '?')} ({why})"]
+        if child in links:
+            holding[child] = parent, None if why else _sdf_joint(joint, child, frames, reading, root.get("version"))
+    reading.rows, reading.joints, looped = _numbered(holding)
+    reading.frozen += looped
     for name, link in links.items():
         pose = frames.pose(name)
         collisions = reading.add(link, partial(frames.place, name), {})
@@ -130,22 +208,27 @@ def read_sdf(path: Path) -> Model:
         if not _flag(inertial.get("auto")):
             moment = 0.0 if inertial.find("inertia") is None else 1.0  # of SDFormat; without any, the shape decides
             found = _inertial(inertial, path, where, (1.0, moment))
-            reading.inertials.append(moved_inertial(pose @ _pose(inertial.find("pose"), path, where), found))
+            own = moved_inertial(pose @ _pose(inertial.find("pose"), path, where), found)
         elif collisions:
             default = _density(inertial, path, where) or 1000.0  # that of SDFormat
             filled = [heavier(solid_of(shape), shape.density or default) for shape in collisions]
             merged = merged_inertial(filled)
             mass = numbers(inertial.findtext("mass"), 1, path, f"mass in {where}", (merged.mass,))[0]
-            reading.inertials.append(heavier(merged, float(mass) / merged.mass))
-    ends = {
-        joint: [(joint.findtext(end) or "").strip() for end in ("parent", "child")]
-        for joint in [*model.findall("joint"), *root.findall("world/joint")]
-    }
-    for name in {name for joint in model.findall("joint") for name in ends[joint]} - {"world"}:
-        frames.pose(name)
-    movable = [joint.get("name", "?") for joint in ends if joint.get("type") != "fixed"]
+            own = heavier(merged, float(mass) / merged.mass)
+        else:
+            continue
+        reading.inertials.append((reading.rows.get(name, 0), own))
     held = _TO_WORLD if any("world" in names for names in ends.values()) else ""
-    return reading.model(movable, "the file says static" if _flag(model.findtext("static")) else held)
+    return reading.model("the file says static" if static else held)
+
+
+def _sdf_joint(element: Element, link: str, frames: _Frames, reading: _Reading, version: str | None) -> Joint | None:
+    """The joint that moves ``link``; before SDF 1.5 its axis is in the frame of the model."""
+    name, axis = element.get("name", ""), element.find("axis/xyz")
+    is_old = version in ("1.0", "1.2", "1.3", "1.4") or _flag(element.findtext("axis/use_parent_model_frame"))
+    base = "__model__" if is_old else (None if axis is None else axis.get("expressed_in")) or name
+    pose = frames.pose(name)
+    return reading.joint(element, link, pose, pose[:3, :3].T @ frames.pose(base)[:3, :3])
 
 
 def _density(element: Element, path: Path, where: str) -> float | None:
@@ -217,8 +300,8 @@ def _pose(element: Element | None, path: Path, where: str) -> Array:
         values = numbers(element.text, 7, path, f"pose of {where}", (0.0,) * 6 + (1.0,))
         return pose_of(values[:3], _from_quaternion(values[3:], path, where))
     values = numbers(element.text, 6, path, f"pose of {where}", (0.0,) * 6)
-    angles = np.radians(values[3:]) if _flag(element.get("degrees")) else values[3:]
-    return pose_of(values[:3], from_roll_pitch_yaw(angles))
+    turn = Rotation.from_euler("xyz", values[3:], degrees=_flag(element.get("degrees")))
+    return pose_of(values[:3], turn.as_matrix())
 
 
 def _from_quaternion(quaternion: Array, path: Path, where: str) -> Array:
@@ -305,7 +388,26 @@ def read_urdf(path: Path) -> Model:
     holding = [j for j in robot.findall("joint") for parent in j.findall("parent") if parent.get("link") == "world"]
     if holding:  # a link that need not be declared
         links.setdefault("world", Element("link", name="world"))
-    poses, movable = _link_poses(robot, links, path)
+    places: dict[str, tuple[str, Array]] = {}  # parent of a link, and its pose there
+    held_by: dict[str, Element] = {}
+    for joint in robot.findall("joint"):
+        name = joint.get("name", "?")
+        ends = [element.get("link", "") if (element := joint.find(t)) is not None else "" for t in ("parent", "child")]
+        for end in ends:
+            if end not in links:
+                raise CorruptFileError(f"{path}: joint {name!r} connects link {end!r}, which does not exist")
+        if ends[1] in places:
+            raise CorruptFileError(f"{path}: link {ends[1]!r} is the child of two joints; a URDF is a tree")
+        places[ends[1]], held_by[ends[1]] = (ends[0], _placed(path, np.eye(4), joint, f"joint {name!r}")), joint
+    roots = [name for name in links if name not in places]
+    if len(roots) != 1:
+        found = ", ".join(map(repr, roots)) or "none (its joints form a loop)"
+        raise CorruptFileError(f"{path}: a URDF has one root link, this one has {found}")
+    frames = _Frames(path, {roots[0]: ("", np.eye(4)), **places})
+    poses = {name: frames.pose(name) for name in links}
+    still = np.eye(3)
+    moved = {link: (places[link][0], reading.joint(j, link, poses[link], still)) for link, j in held_by.items()}
+    reading.rows, reading.joints, _ = _numbered(moved)
     materials: dict[str, Color | None] = {}
     for material in [*robot.findall("material"), *robot.findall("link/visual/material")]:
         if material.find("color") is not None:  # it may be defined inside any visual
@@ -315,31 +417,11 @@ def read_urdf(path: Path) -> Model:
         for inertial in link.findall("inertial")[:1]:
             where = f"inertial of link {name!r}"
             pose = _placed(path, poses[name], inertial, where)
-            reading.inertials.append(moved_inertial(pose, _inertial(inertial, path, where, (0.0, 0.0))))
-    massless = reading.inertials and all(inertial.mass == 0 for inertial in reading.inertials)
+            own = moved_inertial(pose, _inertial(inertial, path, where, (0.0, 0.0)))
+            reading.inertials.append((reading.rows.get(name, 0), own))
+    massless = reading.inertials and all(inertial.mass == 0 for _, inertial in reading.inertials)
     held = _TO_WORLD if any(joint.get("type") not in ("floating", "planar") for joint in holding) else ""
-    return reading.model(movable, "the file gives mass 0" if massless else held)
-
-
-def _link_poses(robot: Element, links: dict[str, Element], path: Path) -> tuple[dict[str, Array], list[str]]:
-    """(4, 4) of each link in the root link's frame, and the names of movable joints."""
-    places: dict[str, tuple[str, Array]] = {}
-    for joint in robot.findall("joint"):
-        name = joint.get("name", "?")
-        ends = [element.get("link", "") if (element := joint.find(t)) is not None else "" for t in ("parent", "child")]
-        for end in ends:
-            if end not in links:
-                raise CorruptFileError(f"{path}: joint {name!r} connects link {end!r}, which does not exist")
-        if ends[1] in places:
-            raise CorruptFileError(f"{path}: link {ends[1]!r} is the child of two joints; a URDF is a tree")
-        places[ends[1]] = ends[0], _placed(path, np.eye(4), joint, f"joint {name!r}")
-    roots = [name for name in links if name not in places]
-    if len(roots) != 1:
-        found = ", ".join(map(repr, roots)) or "none (its joints form a loop)"
-        raise CorruptFileError(f"{path}: a URDF has one root link, this one has {found}")
-    frames = _Frames(path, {roots[0]: ("", np.eye(4)), **places})
-    movable = [joint.get("name", "?") for joint in robot.findall("joint") if joint.get("type") != "fixed"]
-    return {name: frames.pose(name) for name in links}, movable
+    return reading.model("the file gives mass 0" if massless else held)
 
 
 def _placed(path: Path, base: Array, element: Element, where: str) -> Array:
@@ -347,14 +429,14 @@ def _placed(path: Path, base: Array, element: Element, where: str) -> Array:
     origin = element.find("origin")
     if origin is None:
         return base
-    xyz = numbers(origin.get("xyz"), 3, path, f"origin xyz of {where}", _ZERO)
+    xyz = numbers(origin.get("xyz"), 3, path, f"origin xyz of {where}", (0.0, 0.0, 0.0))
     if origin.get("rpy") and origin.get("quat_xyzw"):
         raise CorruptFileError(f"{path}: the origin of {where} has both rpy and quat_xyzw; keep one of them")
     if origin.get("quat_xyzw"):
         quaternion = numbers(origin.get("quat_xyzw"), 4, path, f"origin quat_xyzw of {where}")
         return base @ pose_of(xyz, _from_quaternion(quaternion, path, where))
-    rpy = numbers(origin.get("rpy"), 3, path, f"origin rpy of {where}", _ZERO)
-    return base @ pose_of(xyz, from_roll_pitch_yaw(rpy))
+    rpy = numbers(origin.get("rpy"), 3, path, f"origin rpy of {where}", (0.0, 0.0, 0.0))
+    return base @ pose_of(xyz, Rotation.from_euler("xyz", rpy).as_matrix())
 
 
 def read_mjcf(path: Path) -> Model:
@@ -369,17 +451,27 @@ def read_mjcf(path: Path) -> Model:
         spec = mujoco.MjSpec.from_file(str(path))
         for mesh in spec.meshes:
             check_file(path.parent / spec.meshdir / mesh.file)
+        for texture in spec.textures:  # none is read, whatever its size, and its file may be lost
+            texture.file, texture.cubefiles, texture.builtin = "", [""] * 6, mujoco.mjtBuiltin.mjBUILTIN_FLAT
+            texture.width = texture.height = 1
         model: Any = spec.compile()
     except ValueError as error:
         raise CorruptFileError(f"{path} cannot be read as MJCF: {' '.join(str(error).split())}") from error
     data: Any = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    root = _root_body(model, path)
+    roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
+    if len(roots) > 1:
+        names = ", ".join(repr(model.body(body).name) for body in roots)
+        raise InvalidInputError(f"{path} holds {len(roots)} bodies ({names}); an asset is one, so put each in a file")
+    if not roots and not model.ngeom:
+        raise InvalidInputError(f"{path} holds no <body> and no <geom>")
+    root = roots[0] if roots else 0  # the world itself where it holds all geoms
     bodies = [body for body in range(model.nbody) if root in (0, int(model.body_rootid[body]))]
     base = np.linalg.inv(pose_of(data.xpos[root], data.xmat[root].reshape(3, 3)))
     visuals: list[Shape] = []
     collisions: list[Shape] = []
-    notes = [] if model.ntex == 0 else [f"not read: {model.ntex} texture(s); what has one has the colour of the asset"]
+    notes = _unread(fromstring(spec.to_xml()), "MJCF")
+    rows, joints, frozen = _hinges(model, data, root, bodies, base)
     for geom in range(model.ngeom):
         name = f"geom {model.geom(geom).name or geom!r}"
         shape = _geom(model, geom, base @ pose_of(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)), path, name)
@@ -387,6 +479,7 @@ def read_mjcf(path: Path) -> Model:
             kind, body = mujoco.mjtGeom(model.geom_type[geom]).name[7:].lower(), model.geom_bodyid[geom]
             notes.append(f"{name}, a {kind} of body {model.body(body).name!r}, is left out")
             continue
+        shape = replace(shape, link=rows[int(model.geom_bodyid[geom])])
         if collides := bool(model.geom_contype[geom] | model.geom_conaffinity[geom]):
             collisions.append(shape)
         if model.geom_group[geom] <= 2 or not collides:  # MuJoCo draws the groups 0 to 2
@@ -395,29 +488,54 @@ def read_mjcf(path: Path) -> Model:
     for body in (body for body in bodies if model.body_mass[body] > 0):
         pose = base @ pose_of(data.xipos[body], data.ximat[body].reshape(3, 3))
         own = MassProperties(float(model.body_mass[body]), np.zeros(3), np.diag(model.body_inertia[body]))
-        inertials.append(moved_inertial(pose, own))
-    counts = [(getattr(model, key), what) for key, what in map(str.split, _LEFT_OUT)]
-    notes += [f"not read: {count} {what}" for count, what in counts if count]
-    if (model.geom_friction[:, 0] != 1.0).any():
-        notes.append("not read: friction of geoms, because all objects of a scene have the same")
+        inertials.append((rows[body], moved_inertial(pose, own)))
+    if ((model.geom_contype | model.geom_conaffinity) & ~1).any():
+        notes.append("not read: contype and conaffinity above 1, because all objects of a scene collide")
+    if joints and any(getattr(model, key).any() for key in ("dof_armature", "jnt_stiffness")):
+        notes.append("not read: armature and stiffness of joints")
+    if frozen:
+        notes.append(f"movable joints frozen at zero: {', '.join(frozen)}")
     free = [j for j in range(model.njnt) if model.jnt_type[j] == 0 and model.jnt_bodyid[j] == root]
-    held = [j for j in range(model.njnt) if j not in free and model.jnt_bodyid[j] in bodies]
-    if movable := [model.joint(j).name or f"joint {j}" for j in held]:
-        notes.append(f"movable joints frozen at zero: {', '.join(movable)}")
+    drags = ("dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness") if free else ()
+    drag = [key[4:] for key in drags if getattr(model, key)[free[0]].any()]
+    notes += [f"not read: {name} of the free joint" for name in drag]
     if not free:
         notes.append("it has no free joint: it is welded (`welded: false` makes it free)")
-    return Model(tuple(visuals), tuple(collisions), tuple(inertials), None if free else True, tuple(notes))
+    return Model(
+        tuple(visuals), tuple(collisions), tuple(inertials), None if free else True, tuple(notes), tuple(joints)
+    )
 
 
-def _root_body(model: Any, path: Path) -> int:
-    """The one body on the world; the world itself where it holds all geoms."""
-    roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
-    if len(roots) > 1:
-        names = ", ".join(repr(model.body(body).name) for body in roots)
-        raise InvalidInputError(f"{path} holds {len(roots)} bodies ({names}); an asset is one, so put each in a file")
-    if not roots and not model.ngeom:
-        raise InvalidInputError(f"{path} holds no <body> and no <geom>")
-    return roots[0] if roots else 0
+def _hinges(
+    model: Any, data: Any, root: int, bodies: list[int], base: Any
+) -> tuple[dict[int, int], list[Joint], list[str]]:
+    """For each body the number of the joint that moves it, the joints, and the names of frozen ones."""
+    follows = set(model.eq_obj1id[model.eq_type == 2].tolist())  # mjEQ_JOINT
+    holding, frozen = dict[int, tuple[int, Joint | None]](), list[str]()
+    for body in bodies:
+        own = [j for j in range(model.njnt) if model.jnt_bodyid[j] == body and model.jnt_type[j] != 0]
+        held, why = None, "of the first body" if body == root else "several of a body" if len(own) > 1 else ""
+        for j in own:
+            reason = "ball" if model.jnt_type[j] == 1 else "mimic" if j in follows else why
+            dof, zero = model.jnt_dofadr[j], model.qpos0[model.jnt_qposadr[j]]
+            low, high = (model.jnt_range[j] - zero).tolist() if model.jnt_limited[j] else (-np.inf, np.inf)
+            joint = Joint(
+                name=model.joint(j).name or f"joint_{j}",
+                link=model.body(body).name or f"body_{body}",
+                parent=0,
+                kind="prismatic" if model.jnt_type[j] == 2 else "revolute",
+                pose=base @ pose_of(data.xanchor[j], data.xmat[body].reshape(3, 3)),
+                axis=model.jnt_axis[j].astype(float),
+                limits=(low, high),
+                damping=float(model.dof_damping[dof]),
+                friction=float(model.dof_frictionloss[dof]),
+            )
+            still = [f"{joint.name} ({reason})"] if reason else _why_still(joint)
+            frozen += still
+            held = None if still else joint
+        holding[body] = int(model.body_parentid[body]) if body else -1, held
+    rows, joints, _ = _numbered(holding)
+    return rows, joints, frozen
 
 
 def _geom(model: Any, geom: int, pose: Array, path: Path, name: str) -> Shape | None:
@@ -464,14 +582,19 @@ def read_usd(path: Path) -> Model:
     bodies that no joint connects, or shapes that are sheared.
     """
     stage = open_stage(path)
-    from pxr import Usd, UsdGeom, UsdPhysics
+    from pxr import Gf, UsdGeom, UsdPhysics, UsdSkel
 
     if lost := [" ".join(str(error).split()) for error in stage.GetCompositionErrors()]:
         raise CorruptFileError(f"{path} refers to what cannot be loaded: {lost[0][:300]}")
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         raise InvalidInputError(f"{path} does not state `metersPerUnit`; set it, 1 for metres or 0.01 for centimetres")
     reading = _Stage(path, stage)
-    prims = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.IsActive()]
+    stage.SetEditTarget(stage.GetSessionLayer())
+    while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
+        for prim in instances:
+            prim.SetInstanceable(False)
+    UsdSkel.BakeSkinning(stage.Traverse(), Gf.Interval(0.0))
+    prims = list(stage.Traverse())
     found = [prim for prim in prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
     bodies = [prim for prim in found if UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get()]
     joints = [UsdPhysics.Joint(prim) for prim in prims if prim.IsA(UsdPhysics.Joint)]
@@ -480,8 +603,9 @@ def read_usd(path: Path) -> Model:
         raise InvalidInputError(f"{path} holds {len(found)} bodies ({names}); an asset is one, so put each in a file")
     if many := [prim.GetPath() for prim in prims if prim.IsA(UsdGeom.PointInstancer)]:
         raise InvalidInputError(f"{path}: {many[0]} is a point instancer, which is not read; make its instances prims")
+    lacking = ("kinematicEnabled", "velocity", "angularVelocity", "restitution")  # what an asset does not have
     for prim in prims:
-        values = [(name, prim.GetAttribute(f"physics:{name}")) for name in _NOT_OF_USD]
+        values = [(name, prim.GetAttribute(f"physics:{name}")) for name in lacking]
         reading.notes += [f"not read: {n} of {prim.GetPath()}" for n, value in values if value and np.any(value.Get())]
         if prim.IsA(UsdGeom.Gprim):
             reading.add(prim)
@@ -510,7 +634,7 @@ class _Stage:
         self.notes = [] if stage.HasAuthoredMetadata("upAxis") else ["upAxis is not stated: y is up, as USD says"]
         self.visuals: list[Shape] = []
         self.collisions: list[tuple[Any, Shape]] = []  # with their prims
-        self.inertials: list[MassProperties] = []
+        self.inertials: list[tuple[int, MassProperties]] = []
 
     def _matrix(self, prim: Any) -> tuple[Array, Array]:
         """(3, 3) and (3,) m that take coordinates of a prim, in its unit, to the model frame."""
@@ -526,7 +650,7 @@ class _Stage:
         owner = next((p for p in _and_above(prim) if p.HasAPI(UsdPhysics.CollisionAPI)), None)
         collides = owner is not None and UsdPhysics.CollisionAPI(owner).GetCollisionEnabledAttr().Get() is not False
         image = UsdGeom.Imageable(prim)
-        drawn = image.ComputePurpose() in ("default", "render") and image.ComputeVisibility() != "invisible"
+        drawn = image.ComputePurpose() in ("default", "render") and image.ComputeVisibility(0.0) != "invisible"
         shape = self._mesh(prim, owner) if prim.IsA(UsdGeom.Mesh) else self._primitive(prim)
         if shape is None:
             self.notes.append(f"{prim.GetPath()} is a {prim.GetTypeName()}, which is left out")
@@ -537,14 +661,19 @@ class _Stage:
     def _mesh(self, prim: Any, owner: Any) -> Shape:
         """A mesh, a hull where its collider (of ``owner``) is one."""
         import trimesh
+        from pxr import UsdShade
 
         where, colors, (matrix, place) = str(prim.GetPath()), self._colors(prim), self._matrix(prim)
         names = ("points", "faceVertexIndices", "faceVertexCounts")
-        found, corners, counts = (np.array(prim.GetAttribute(name).Get() or ()) for name in names)
+        found, corners, counts = (np.array(prim.GetAttribute(name).Get(0.0) or ()) for name in names)
         corners, counts, points = corners.astype(int), counts.astype(int), found.reshape(-1, 3).astype(float)
         if counts.sum() != len(corners) or not len(corners) or not 0 <= corners.min() <= corners.max() < len(points):
             raise CorruptFileError(f"{self.path}: the faces of {where} do not fit to its points")
-        self.notes += [f"{where}: its holes are filled"] if prim.GetAttribute("holeIndices").Get() else []
+        self.notes += [f"{where}: its holes are filled"] if prim.GetAttribute("holeIndices").Get(0.0) else []
+        smooth = prim.GetAttribute("subdivisionScheme")
+        self.notes += [f"{where}: it is not subdivided"] * (smooth.HasAuthoredValue() and smooth.Get() != "none")
+        parts = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
+        self.notes += [f"not read: materials of parts of {where}"] if parts else []
         cut, polygons = cut_polygons(points, corners, counts)
         check_triangles(self.path, len(cut))
         inside_out = (prim.GetAttribute("orientation").Get() == "leftHanded") != (np.linalg.det(matrix) < 0)
@@ -584,7 +713,7 @@ class _Stage:
         """(N, 3) in 0..255 from the linear colours of a prim, N 0 without any."""
         from pxr import UsdGeom, UsdShade
 
-        values = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get() or ()
+        values = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor").ComputeFlattened(0.0) or ()
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
         for shader in material.GetPrim().GetChildren() if material else ():
             diffuse = shader.GetAttribute("inputs:diffuseColor")
@@ -626,7 +755,7 @@ class _Stage:
             quaternion = [*axes.GetImaginary(), axes.GetReal()] if axes and axes.GetLength() else [0.0, 0.0, 0.0, 1.0]
             turn = matrix / np.linalg.norm(matrix, axis=0) @ Rotation.from_quat(quaternion).as_matrix()
             found = found._replace(inertia=(turn * np.array(moments) * self.kilograms * self.unit**2) @ turn.T)
-        self.inertials.append(found)
+        self.inertials.append((0, found))
 
 
 def _one(colors: Any) -> Color | None:
@@ -636,7 +765,7 @@ def _one(colors: Any) -> Color | None:
 
 def _number(prim: Any, name: str) -> float:
     """A number of a prim; 0 where it has none."""
-    return float((prim.GetAttribute(name).Get() if prim and prim.HasAttribute(name) else None) or 0.0)
+    return float((prim.GetAttribute(name).Get(0.0) if prim and prim.HasAttribute(name) else None) or 0.0)
 
 
 def _and_above(prim: Any) -> list[Any]:

@@ -242,7 +242,7 @@ def _decompose(body: trimesh.Trimesh, method: Method, threshold: float, what: st
     pieces = _read(path)
     if pieces is not None:
         return pieces
-    if not _has_coacd():
+    if find_spec("coacd") is None:
         if method == "coacd":
             raise MissingDependencyError(
                 f"{what} asks for CoACD, which is not installed; `pip install 'scene-envs[decomposition]'`"
@@ -273,13 +273,6 @@ def coacd_settings(threshold: float) -> dict[str, Any]:
         "decimate": True,
         "seed": 0,
     }
-
-
-def _has_coacd() -> bool:
-    try:
-        return find_spec("coacd") is not None
-    except ValueError:  # a module without a spec
-        return False
 
 
 def run_coacd(vertices: Array, faces: Array, settings: dict[str, Any], what: str) -> list[Array]:

@@ -150,24 +150,24 @@ def _unlisted(folder: Path, stamp: tuple[int, int]) -> FolderIndex:
 
 def _named_files(path: Path) -> set[Path]:
     """The files that a URDF, SDF, MJCF or USD uses; empty when it cannot be read."""
-    try:
+    files, elements = [path], []
+    with contextlib.suppress(SceneEnvsError, OSError):
         if path.suffix.lower().startswith(".usd"):
             stage = open_stage(path)
             return {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers()} - {path.resolve()}
-        root = read_xml(path)
-    except SceneEnvsError:
-        return set()
-    found = {(path.parent / part.get("file", "")).resolve() for part in root.iter("include") if part.get("file")}
-    roots = [root]
-    for part in found:
+    for file in files:
         with contextlib.suppress(SceneEnvsError, OSError):
-            roots.append(read_xml(part))
-    places = [item.get("meshdir", item.get("assetdir", "")) for one in roots for item in one.iter("compiler")] or [""]
-    meshes = [mesh.get("file", "") for one in roots for mesh in one.iter("mesh")]
-    found |= {(path.parent / place / mesh).resolve() for mesh in meshes for place in places}
-    for uri in [mesh.get("filename") or mesh.findtext("uri") or "" for mesh in root.iter("mesh")]:
+            elements += (new := [*read_xml(file).iter()])
+            parts = [part.get("file") for part in new if part.tag in ("include", "model")]
+            files += {(path.parent / part).resolve() for part in parts if part} - {*files}
+    found, settings = {*files[1:]}, [element for element in elements if element.tag == "compiler"]
+    places = [element.get("meshdir", element.get("assetdir", "")) for element in settings] or [""]
+    is_bare = any(element.get("strippath") == "true" for element in settings)
+    for mesh in (element for element in elements if element.tag == "mesh"):
+        name = Path(mesh.get("file", ""))
+        found |= {(path.parent / place / (name.name if is_bare else name)).resolve() for place in places}
         with contextlib.suppress(SceneEnvsError, OSError):
-            found.add(find_mesh(uri, path, "a mesh"))
+            found.add(find_mesh(mesh.get("filename") or mesh.findtext("uri") or "", path, "a mesh"))
     return found
 
 
@@ -187,24 +187,20 @@ def build_in_time(request: tuple[Path, AssetEntry]) -> tuple[Asset, AssetReport]
         return build_asset(*request)
 
 
-def _build_apart(path: Path, entry: AssetEntry) -> tuple[Asset, AssetReport]:
-    """As :func:`build_in_time`, in a process of its own; InvalidInputError when it takes too long or crashes."""
-    with timed(path):
-        try:
-            return run_apart(f"{__name__}:build_in_time", (path, entry), seconds_left())  # type: ignore[no-any-return]
-        except WorkerFailure as failure:
-            if failure.is_late:
-                raise too_slow("") from None
-            raise InvalidInputError(f"{path}: the import {failure}; simplify the file") from failure
-
-
 @cache
 def _built(path: Path, entry: AssetEntry, stamp: tuple[int, int]) -> tuple[Asset, AssetReport]:
+    """As :func:`build_in_time`, large files in a process of their own; InvalidInputError when it is late or crashes."""
     try:
         with timed(path, READ_HERE):
             asset, report = in_time(lambda: build_asset(path, entry))
     except LargeImportError:
-        asset, report = _build_apart(path, entry)
+        with timed(path):
+            try:
+                asset, report = run_apart(f"{__name__}:build_in_time", (path, entry), seconds_left())
+            except WorkerFailure as failure:
+                if failure.is_late:
+                    raise too_slow("") from None
+                raise InvalidInputError(f"{path}: the import {failure}; simplify the file") from failure
     level = logging.WARNING if report.warnings else logging.INFO
     _LOGGER.log(level, "%s", report)
     return asset, report

@@ -1,11 +1,10 @@
 """Built-in assets, whose shapes are a table, ``tables.json``.
 
-An entry holds the facts of :func:`~scene_envs.assets.base.asset_recipe`, the groups of assets it belongs to, and rows
-of shapes. The first key of a row names a function of :mod:`scene_envs.assets.shapes` or of
-:mod:`scene_envs.assets.recipes.painted` and gives its first argument, the others are keywords; ``at`` lists the places
-(x, y, z) m of a box, or of a mesh that ``turn`` (3, 3) rotates. ``coarse`` holds numbers of rows, for their parts, and
-lists of such numbers, for hulls of them; without it, the coarse parts are the fine ones. Colours are ``#rrggbb``,
-lengths m, angles rad.
+An entry holds the facts of :func:`~scene_envs.assets.base.asset_recipe` and rows of shapes. The first key of a row
+names a function of :mod:`scene_envs.assets.shapes` or of :mod:`scene_envs.assets.recipes.painted` and gives its first
+argument, the others are keywords; ``at`` lists the places (x, y, z) m of a box, or of a mesh that ``turn`` (3, 3)
+rotates. ``coarse`` holds numbers of rows, for their parts, and lists of such numbers, for hulls of them; without it,
+the coarse parts are the fine ones. Colours are ``#rrggbb``, lengths m, angles rad.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Any
 
 import trimesh
 
-from scene_envs.assets.base import ASSET_GROUPS, ConvexPart, Model, asset_recipe
+from scene_envs.assets.base import ConvexPart, Model, asset_recipe
 from scene_envs.assets.recipes.painted import bar, barrel, beam, printed, prism, revolve, scoop, slabs, sleeve
 from scene_envs.assets.shapes import (
     FACES,
@@ -97,5 +96,3 @@ def _model(entry: dict[str, Any]) -> Model:
 for _name, _entry in json.loads(Path(__file__).with_suffix(".json").read_text("utf-8")).items():
     _facts = {key: _decoded(_entry[key]) for key in ("display_name", "plural", "mass", "color") if key in _entry}
     asset_recipe(_name, **_facts)(partial(_model, _entry))
-    for _group in _entry.get("groups", ()):
-        ASSET_GROUPS[_group] = ASSET_GROUPS.get(_group, frozenset()) | {_name}
