@@ -7,7 +7,7 @@ opened. Objects that meet no other object on this way are at rest; all others ar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import NEAR, Collider, scene_pairs
 from scene_envs.physics.parts import (
     GRAVITY,
-    AssetGeometry,
     ContactFace,
     Rows,
     apply,
@@ -91,9 +90,10 @@ class Statics:
 
     def __init__(self, collider: Collider) -> None:
         self._collider, self._library = collider, (library := collider.library)
-        self._foot = _Polygons.of([_foot(asset) for asset in library.assets])
+        down = (1.0, 1.0, -1.0)  # heights of feet and undersides are downward
+        self._foot = _Polygons.of([_surface(asset.fine.vertices * down, _FOOT) for asset in library.assets])
         self._surface = _Polygons.of([_surface(part.vertices) for part in library.parts])
-        self._under = _Polygons.of([_surface(part.vertices * (1.0, 1.0, -1.0)) for part in library.parts])
+        self._under = _Polygons.of([_surface(part.vertices * down) for part in library.parts])
         for asset in library.assets:
             if asset.is_hollow:  # the coarse parts have tops where there is nothing to stand on
                 self._surface.offsets[asset.coarse.ids] = -np.inf
@@ -142,7 +142,7 @@ class Statics:
         upper, lower = np.where(up, second, first), np.where(up, first, second)
         part = np.where(up, contacts.part_first[vertical], contacts.part_second[vertical])
         z = objects.translation[:, 2]
-        foot = z[upper] + self._foot.height[objects.category[upper]]
+        foot = z[upper] - self._foot.height[objects.category[upper]]
         with np.errstate(invalid="ignore"):
             meets = np.abs(foot - z[lower] - self._surface.height[part] - contacts.gap[vertical]) < _MEETS
         good = meets & upright[upper] & upright[lower] & (contacts.gap[vertical] > -_DEEPEST) & ~objects.fixed[upper]
@@ -195,7 +195,7 @@ class Statics:
         tops = _out_of(objects, lower[q], self._surface.corners[part[q]])
         on_top = self._surface.outside(part[q], _into(objects, lower[q], feet)) < 0.0
         on_foot = self._under.outside(own[q], _into(objects, upper[q], tops)) < 0.0
-        lowest = np.abs(self._under.height[own[q]] + self._foot.height[objects.category[upper[q]]]) < _FOOT
+        lowest = np.abs(self._under.height[own[q]] - self._foot.height[objects.category[upper[q]]]) < _FOOT
         points, met = np.concatenate([feet, tops], axis=1), np.concatenate([on_top, on_foot], axis=1) & lowest[:, None]
         for index in np.unique(upper[q]):
             mine = upper[q] == index
@@ -325,18 +325,10 @@ def _outline(points: Array) -> Array | None:
     return outline if outline is not None and area(outline) > 1e-7 else None
 
 
-def _foot(asset: AssetGeometry) -> tuple[float, Array] | None:
-    """Height and outline of the lowest corners of all fine parts."""
-    vertices = asset.fine.vertices
-    height = float(vertices[:, 2].min())
-    outline = _outline(vertices[vertices[:, 2] < height + _FOOT][:, :2])
-    return None if outline is None else (height, outline)
-
-
-def _surface(vertices: Array) -> tuple[float, Array] | None:
-    """Height and outline of the flat top of the corners (V, 3) of a part or of all parts."""
+def _surface(vertices: Array, depth: float = 1e-5) -> tuple[float, Array] | None:
+    """Height and outline of the flat top of the corners (V, 3) of a part or of all parts, ``depth`` (m) thick."""
     height = float(vertices[:, 2].max())
-    outline = _outline(vertices[vertices[:, 2] > height - 1e-5][:, :2])
+    outline = _outline(vertices[vertices[:, 2] > height - depth][:, :2])
     return None if outline is None else (height, outline)
 
 
@@ -352,11 +344,8 @@ class _Faces:
 
     @classmethod
     def of(cls, faces: list[ContactFace | None]) -> _Faces:
-        def column(name: str) -> Array:
-            return np.array([np.nan if face is None else getattr(face, name) for face in faces])
-
-        center = np.array([(np.nan, np.nan) if face is None else face.center for face in faces])
-        return cls(column("height"), center, column("inner"), column("corners"), column("hole"))
+        none = ContactFace(np.nan, (np.nan, np.nan), np.nan, np.nan, np.nan)
+        return cls(*(np.array([getattr(face or none, field.name) for face in faces]) for field in fields(cls)))
 
 
 def clusters(objects: Objects, low: Array, high: Array) -> Index:
