@@ -34,19 +34,19 @@ def simulated_fine(batch: SceneBatch, *, everything: bool) -> FeasibilityResult:
     physics = physics_of(batch.scene_type, "bullet")
 
     def all_fine(objects: Objects, pairs: ObjectPairs) -> np.ndarray:
-        return physics.support.hollow[objects.category]
+        return physics.statics.hollow[objects.category]
 
     def none_rest(self: Physics, objects: Objects, pairs: ObjectPairs, duration: float) -> Rest:
         return Rest(np.zeros(len(objects), bool), np.zeros(len(objects)), np.zeros(len(objects)))
 
     real = Physics.rest
-    physics.support.needs_fine = all_fine  # type: ignore[method-assign]
+    physics.statics.needs_fine = all_fine  # type: ignore[method-assign]
     if everything:
         Physics.rest = none_rest  # type: ignore[method-assign]
     try:
         return feasibility(batch)
     finally:
-        del physics.support.needs_fine
+        del physics.statics.needs_fine
         Physics.rest = real  # type: ignore[method-assign]
 
 

@@ -204,6 +204,12 @@ def walls(low: Array, high: Array) -> Array:
     return np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1)
 
 
+def facing(quads: Array) -> Array:
+    """(P, 3): unit normals of quadrilaterals (P, 4, 3), by their diagonals."""
+    normals = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)  # type: ignore[no-any-return]
+
+
 def grid_faces(rows: int, around: int) -> NDArray[np.int64]:
     """(2 (rows - 1) around, 3): triangles between neighbouring rows of points, each row closed around."""
     grid = np.arange(rows * around).reshape(rows, around)
@@ -239,34 +245,29 @@ def _span(
 ) -> trimesh.Trimesh:
     unit = circle(segments, phase)
     corners = [np.column_stack([r * unit, np.full(segments, z)]) for r, z in (low, high)]
-    here, there = np.arange(segments), (np.arange(segments) + 1) % segments
     degenerate = np.array([low[0] == 0.0, high[0] == 0.0])
     keep = np.repeat(~degenerate, segments)  # a span that starts or ends on the axis has half as many triangles
     if flat:
-        quads = np.stack([corners[0], corners[0][there], corners[1][there], corners[1]], axis=1)
-        facing = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
-        facing /= np.linalg.norm(facing, axis=1, keepdims=True)
-        return surface(quads.reshape(-1, 3), quad_faces(segments)[keep], color, facing.repeat(4, axis=0))
-    faces = np.concatenate(
-        [np.stack([here, there, segments + there], axis=1), np.stack([here, segments + there, segments + here], axis=1)]
-    )
+        quads = walls(*corners)
+        return surface(quads.reshape(-1, 3), quad_faces(segments)[keep], color, facing(quads).repeat(4, axis=0))
     radial = [np.column_stack([n[0] * unit, np.full(segments, n[1])]) / np.linalg.norm(n) for n in normals]
-    return surface(np.concatenate(corners), faces[keep], color, np.concatenate(radial))
+    return surface(np.concatenate(corners), grid_faces(2, segments)[keep], color, np.concatenate(radial))
 
 
-def tube(path: ArrayLike, radii: ArrayLike, color: Color, *, sides: int = 10) -> trimesh.Trimesh:
-    """A round tube along a path (P, 3) in the x-z plane, with flat end caps; ``radii`` is one, or one per point."""
-    points = np.asarray(path, dtype=np.float64)
+def tube(
+    path: Sequence[tuple[float, float, float]], radii: ArrayLike, color: Color, *, samples: int = 0, sides: int = 10
+) -> trimesh.Trimesh:
+    """A round tube along a path of P points (m) in the x-z plane, with flat end caps; ``samples`` puts that many points
+    on a smooth curve through the path. ``radii`` (m) is one, or one per point.
+    """
+    points = arc(path, samples) if samples else np.asarray(path, dtype=np.float64)
     size = np.broadcast_to(np.asarray(radii, dtype=np.float64), (len(points),))
     tangents = np.gradient(points, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     across = np.stack([tangents[:, 2], np.zeros(len(points)), -tangents[:, 0]], axis=1)
     unit = circle(sides)
     spokes = across[:, None] * unit[None, :, :1] + np.array([0.0, 1.0, 0.0]) * unit[None, :, 1:]  # (P, sides, 3)
-    vertices = points[:, None] + size[:, None, None] * spokes
-    body = surface(vertices.reshape(-1, 3), grid_faces(len(points), sides), color, spokes.reshape(-1, 3))
-    caps = [surface(vertices[0], fan(sides)[:, ::-1], color), surface(vertices[-1], fan(sides), color)]
-    return join(body, *caps)
+    return loft(points[:, None] + size[:, None, None] * spokes, color, normals=spokes)
 
 
 def planks(
@@ -294,8 +295,8 @@ def planks(
     return join(*strips)
 
 
-def arc(points: Sequence[tuple[float, float, float]], samples: int = 16) -> Array:
-    """(samples, 3): a smooth curve through the points, for the visual of handles and spouts."""
+def arc(points: Sequence[tuple[float, float, float]], samples: int) -> Array:
+    """(samples, 3): a smooth curve through the points, for the visual of handles, spouts and fruit."""
     from scipy.interpolate import make_interp_spline
 
     knots = np.asarray(points, dtype=np.float64)
@@ -400,15 +401,29 @@ def lettering(
     return patches
 
 
-def loft(sections: ArrayLike, color: Color, *, caps: tuple[bool, bool] = (True, True)) -> trimesh.Trimesh:
+def tiles(palette: Sequence[Color], columns: Sequence[str]) -> list[Patch]:
+    """Patches that cover a face: columns of digits from left to right, each upward, that choose from ``palette``."""
+    across, up = len(columns), len(columns[0])
+    return [
+        Patch(i / across, j / up, (i + 1) / across, (j + 1) / up, palette[int(digit)])
+        for i, column in enumerate(columns)
+        for j, digit in enumerate(column)
+    ]
+
+
+def loft(
+    sections: ArrayLike, color: Color, *, caps: tuple[bool, bool] = (True, True), normals: Array | None = None
+) -> trimesh.Trimesh:
     """A smooth skin through P sections of K points each (P, K, 3), m, with flat caps at its first and last end. The
-    points run counter-clockwise when seen from the last section looking back at the first.
+    points run counter-clockwise when seen from the last section looking back at the first. ``normals`` (P, K, 3) of the
+    skin default to those of the faces around a point.
     """
     grid = np.asarray(sections, dtype=np.float64)
     count, around = grid.shape[:2]
-    ends = [surface(grid[0], fan(around)[:, ::-1], color), surface(grid[-1], fan(around), color)]
+    ends = [surface(grid[0], fan(around)[:, ::-1], color), sheet(grid[-1], color)]
+    shading = None if normals is None else normals.reshape(-1, 3)
     return join(
-        surface(grid.reshape(-1, 3), grid_faces(count, around), color),
+        surface(grid.reshape(-1, 3), grid_faces(count, around), color, shading),
         *(end for end, kept in zip(ends, caps, strict=True) if kept),
     )
 

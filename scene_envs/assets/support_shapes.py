@@ -39,7 +39,6 @@ class LibraryShapes:
     low: Tensor  # (C, 2) lowest corner of the maps
     cell: Tensor  # (C, 2) size of a cell
     rim: Tensor  # (C,) height of the lowest way out of a container; -inf for other assets
-    well: Tensor  # (C,) height of the bottom of a container
     tiers: Tensor  # (C, L) heights of tiers from the top, NaN beyond their number; assets with fewer than two have none
     static: Tensor  # (C,) bool
 
@@ -61,9 +60,9 @@ def library_shapes(library: AssetLibrary, device: torch.device) -> LibraryShapes
     size = max(len(p) for p in points)
     levels = [_tiers(asset) for asset in assets]
     most = max(1, *(len(level) for level in levels))
-    wells = np.array([_hollow(asset, *maps) for asset, *maps in zip(assets, top, wide, low, cell, strict=True)])
     tables = {name: np.stack([getattr(asset, name) for asset in assets]) for name in ("bounds", "static")}
-    tables |= {"center": np.stack([asset.center_of_mass for asset in assets]), "rim": wells[:, 0], "well": wells[:, 1]}
+    tables["rim"] = np.array([_rim(asset, *maps) for asset, *maps in zip(assets, top, wide, low, cell, strict=True)])
+    tables["center"] = np.stack([asset.center_of_mass for asset in assets])
     tables |= {"top": top, "wide": wide, "covered": covered, "low": low, "cell": cell}
     tables["points"] = np.stack([np.concatenate([p, np.repeat(p[:1], size - len(p), axis=0)]).T for p in points])
     tables["tiers"] = np.stack([np.concatenate([level, np.full(most - len(level), np.nan)]) for level in levels])
@@ -115,8 +114,8 @@ def _extreme_points(parts: Iterable[ConvexPart]) -> Array:
     return vertices[np.unique((vertices @ np.concatenate([directions, axes]).T).argmax(axis=0))]
 
 
-def _hollow(asset: Asset, top: Array, wide: Array, low: Array, cell: Array) -> tuple[float, float]:
-    """(rim, well): the lowest way out of the hollow around the centre of mass, and its bottom, m."""
+def _rim(asset: Asset, top: Array, wide: Array, low: Array, cell: Array) -> float:
+    """Height (m) of the lowest way out of the hollow around the centre of mass; -inf where there is no hollow."""
     start = asset.center_of_mass[:2]
     steps = np.linspace(0.0, 1.0, 2 * _GRID) * np.linalg.norm(asset.bounds[1, :2] - asset.bounds[0, :2])
     angles = np.arange(24) * np.pi / 12.0
@@ -127,9 +126,7 @@ def _hollow(asset: Asset, top: Array, wide: Array, low: Array, cell: Array) -> t
     heights = wide[cells[..., 0], cells[..., 1]]
     first = cells[0, 0]
     rim, well = float(heights.max(axis=0).min()), float(top[first[0], first[1]])
-    if asset.static or not np.isfinite(well) or rim - well < _HOLLOW:
-        return -np.inf, -np.inf
-    return rim, well
+    return -np.inf if asset.static or not np.isfinite(well) or rim - well < _HOLLOW else rim
 
 
 def _tiers(asset: Asset) -> Array:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         project,
         settle,
     )
-    from scene_envs.physics.pool import PhysicsPool, RayPhysicsPool, make_pool
+    from scene_envs.physics.pool import PhysicsPool, make_pool
     from scene_envs.physics.readiness import make_ready
 
 __all__ = [
@@ -35,7 +35,6 @@ __all__ = [
     "PenetrationResult",
     "PhysicsPool",
     "ProjectionResult",
-    "RayPhysicsPool",
     "ReadyResult",
     "SettleResult",
     "equilibrium",

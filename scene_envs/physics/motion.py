@@ -15,7 +15,7 @@ from scene_envs.physics.engines import Course, Engine, Moved
 from scene_envs.physics.mujoco import MujocoEngine
 from scene_envs.physics.parts import GRAVITY, LibraryGeometry, library_geometry
 from scene_envs.physics.placement import Budget, ObjectPairs, Objects, components, object_boxes, place
-from scene_envs.physics.statics import Rest, Statics, Support, clusters, company
+from scene_envs.physics.statics import Rest, Statics, clusters, company
 from scene_envs.scene_types import SceneType
 
 _FAR, _MARGIN = 2e-3, 1e-3
@@ -35,32 +35,26 @@ _STILL, _STILL_ANGLE = 5e-5, 5e-4
 """An object that moved less than this (m, rad) in a segment has come to rest."""
 
 
-def make_engine(name: str, library: LibraryGeometry) -> Engine:
-    """The engine ``name`` for clusters of the assets of ``library``; that of Warp, which simulates whole batches, is
-    MuJoCo here.
-    """
-    if name == "bullet":
-        from scene_envs.physics.bullet import BulletEngine
-
-        return BulletEngine(library)
-    return MujocoEngine(library)
-
-
 class Physics:
     """Collision geometry, tests of support and rest, and the engine of one asset library, kept by this process."""
 
     def __init__(self, library: LibraryGeometry, engine: str) -> None:
         self.library = library
-        self.engine = make_engine(engine, library)
+        self.engine: Engine
+        if engine == "bullet":
+            from scene_envs.physics.bullet import BulletEngine
+
+            self.engine = BulletEngine(library)
+        else:  # for Warp, too, which simulates whole batches
+            self.engine = MujocoEngine(library)
         self.collider = Collider(library)
-        self.support = Support(library)
         self.statics = Statics(self.collider)
         self._known: dict[bytes, tuple[Moved, float]] = {}
         self._lock = threading.Lock()
 
     def rest(self, objects: Objects, pairs: ObjectPairs, duration: float) -> Rest:
         """Objects of some scenes that need no simulation for ``duration`` seconds."""
-        contacts = self.collider.contacts(objects, pairs, self.support.differs(objects, pairs))
+        contacts = self.collider.contacts(objects, pairs, self.statics.differs(objects, pairs))
         return self.statics.at_rest(objects, pairs, contacts, duration)
 
     def simulate(self, cluster: Objects, fine: Mask, height: Index, duration: float, course: Course) -> Moved:
@@ -224,7 +218,7 @@ def _simulate(
     rows = np.flatnonzero(due | objects.fixed)
     among, near = objects[rows], pairs.among(rows)
     fine, height = np.zeros(len(objects), dtype=bool), np.zeros(len(objects), dtype=np.int64)
-    fine[rows], height[rows] = physics.support.needs_fine(among, near), physics.support.tallest(among, near)
+    fine[rows], height[rows] = physics.statics.needs_fine(among, near), physics.statics.tallest(among, near)
     reach = _REACH + 0.5 * GRAVITY * duration**2
     for label in np.unique(group[due]):
         if course.budget.is_spent:

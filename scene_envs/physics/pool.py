@@ -108,42 +108,27 @@ def _scene_type_message(key: int, scene_type: SceneType) -> tuple[Any, ...]:
     return "scene_type", key, dataclasses.replace(scene_type), assets
 
 
-class RayPhysicsPool(PhysicsPool):
-    """A :class:`PhysicsPool` whose workers are actors of a Ray cluster, as many as it has CPUs.
-
-    Order, retries, timeouts and results are those of a pool of processes. The cluster is the one that this process is
-    connected to, or else the one that ``RAY_ADDRESS`` names. Without either it is a cluster on this machine, which ends
-    with the last pool. Actors are spread over the machines of the cluster. Each machine needs this package.
-
-    Args:
-        timeout: seconds that a chunk of up to eight scenes may take.
-        physics: engine that computes overlap and motion.
-
-    Raises:
-        MissingDependencyError: Ray is not installed.
-        InvalidInputError: there is no cluster at ``RAY_ADDRESS``.
-    """
-
-    def __init__(self, timeout: float = 60.0, physics: str = "auto") -> None:
-        super().__init__(None, timeout, physics, ray=True)
-
-
 def make_pool(workers: int | str, timeout: float = 60.0, physics: str = "auto") -> PhysicsPool:
-    """A pool of processes of this machine, or with ``"ray"`` of a Ray cluster.
+    """A pool of processes of this machine, or with ``"ray"`` of actors of a Ray cluster, as many as it has CPUs.
+
+    The cluster is the one that this process is connected to, or else the one that ``RAY_ADDRESS`` names. Without either
+    it is a cluster on this machine, which ends with the last pool. Actors are spread over the machines of the cluster.
+    Each machine needs this package. Order, retries, timeouts and results are those of a pool of processes.
 
     Args:
-        workers: number of processes, 0 for this one alone; ``"ray"`` for as many as the cluster has CPUs.
+        workers: number of processes, 0 for this one alone, or ``"ray"``.
         timeout: seconds for a chunk, as :class:`PhysicsPool` takes it.
         physics: engine that computes overlap and motion.
 
     Raises:
-        InvalidInputError: ``workers`` is neither a whole number nor ``"ray"``.
+        InvalidInputError: ``workers`` is neither a whole number nor ``"ray"``, or no cluster is at ``RAY_ADDRESS``.
+        MissingDependencyError: Ray is not installed.
 
     >>> make_pool(0).workers
     0
     """
     if workers == "ray":
-        return RayPhysicsPool(timeout, physics)
+        return PhysicsPool(None, timeout, physics, ray=True)
     if not isinstance(workers, int):
         raise InvalidInputError(
             f"workers={workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"

@@ -7,7 +7,7 @@ opened. Objects that meet no other object on this way are at rest; all others ar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -15,9 +15,7 @@ from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import NEAR, Collider, scene_pairs
 from scene_envs.physics.parts import (
     GRAVITY,
-    AssetGeometry,
     ContactFace,
-    LibraryGeometry,
     Rows,
     apply,
     area,
@@ -88,21 +86,23 @@ class _Polygons:
 
 
 class Statics:
-    """Closed-form test of rest, from precomputed feet and surfaces."""
+    """Closed-form tests of rest and of contacts, from precomputed feet, surfaces and faces."""
 
     def __init__(self, collider: Collider) -> None:
         self._collider, self._library = collider, (library := collider.library)
-        self._foot = _Polygons.of([_foot(asset) for asset in library.assets])
+        down = (1.0, 1.0, -1.0)  # heights of feet and undersides are downward
+        self._foot = _Polygons.of([_surface(asset.fine.vertices * down, _FOOT) for asset in library.assets])
         self._surface = _Polygons.of([_surface(part.vertices) for part in library.parts])
-        self._under = _Polygons.of([_surface(part.vertices * (1.0, 1.0, -1.0)) for part in library.parts])
+        self._under = _Polygons.of([_surface(part.vertices * down) for part in library.parts])
         for asset in library.assets:
             if asset.is_hollow:  # the coarse parts have tops where there is nothing to stand on
                 self._surface.offsets[asset.coarse.ids] = -np.inf
         # the top face may be a rim round a hole
         rims = [None if asset.top is None else _surface(asset.fine.vertices) for asset in library.assets]
         self._rim = _Polygons.of(rims)
-        self._top = _Faces.of([asset.top for asset in library.assets])
-        self._bottom = _Faces.of([asset.bottom for asset in library.assets])
+        self.top = _Faces.of([asset.top for asset in library.assets])
+        self.bottom = _Faces.of([asset.bottom for asset in library.assets])
+        self.hollow = np.array([asset.is_hollow for asset in library.assets])
 
     def at_rest(self, objects: Objects, pairs: ObjectPairs, contacts: Contacts, duration: float) -> Rest:
         """Objects of one or more scenes that need no simulation for ``duration`` seconds."""
@@ -142,7 +142,7 @@ class Statics:
         upper, lower = np.where(up, second, first), np.where(up, first, second)
         part = np.where(up, contacts.part_first[vertical], contacts.part_second[vertical])
         z = objects.translation[:, 2]
-        foot = z[upper] + self._foot.height[objects.category[upper]]
+        foot = z[upper] - self._foot.height[objects.category[upper]]
         with np.errstate(invalid="ignore"):
             meets = np.abs(foot - z[lower] - self._surface.height[part] - contacts.gap[vertical]) < _MEETS
         good = meets & upright[upper] & upright[lower] & (contacts.gap[vertical] > -_DEEPEST) & ~objects.fixed[upper]
@@ -173,21 +173,21 @@ class Statics:
         q = np.flatnonzero(inside)
         up = objects.category[upper[q]]
         corners = _into(objects, lower[q], _out_of(objects, upper[q], self._foot.corners[up]))
-        good[q] = (self._bottom.hole[up] == 0) | (self._surface.outside(part[q], corners).max(axis=1) < 0.0)
+        good[q] = (self.bottom.hole[up] == 0) | (self._surface.outside(part[q], corners).max(axis=1) < 0.0)
         # The test of the rim gives the same result for all parts of the two objects.
         _, leading = np.unique(upper, return_index=True)
         q = leading[candidates[leading]]
         up, down = objects.category[upper[q]], objects.category[lower[q]]
         at_rim = np.abs(self._rim.height[down] - self._surface.height[part[q]]) < _MEETS
         offset = np.linalg.norm(
-            _into(objects, lower[q], _out_of(objects, upper[q], self._bottom.center[up][:, None]))[:, 0]
-            - self._top.center[down],
+            _into(objects, lower[q], _out_of(objects, upper[q], self.bottom.center[up][:, None]))[:, 0]
+            - self.top.center[down],
             axis=1,
         )
         at_rim &= self._rim.outside(down, local[q])[:, 0] < -_BALANCE
-        hole = self._bottom.hole[up]
-        at_rim &= offset <= self._bottom.corners[up] - self._top.hole[down]
-        at_rim &= (hole == 0) | (offset <= self._top.corners[down] - hole)
+        hole = self.bottom.hole[up]
+        at_rim &= offset <= self.bottom.corners[up] - self.top.hole[down]
+        at_rim &= (hole == 0) | (offset <= self.top.corners[down] - hole)
         good[q] |= at_rim
         # Or several parts carry it, whose contacts are all round the centre of mass.
         q = np.flatnonzero(candidates & ~np.isin(upper, upper[good]))
@@ -195,7 +195,7 @@ class Statics:
         tops = _out_of(objects, lower[q], self._surface.corners[part[q]])
         on_top = self._surface.outside(part[q], _into(objects, lower[q], feet)) < 0.0
         on_foot = self._under.outside(own[q], _into(objects, upper[q], tops)) < 0.0
-        lowest = np.abs(self._under.height[own[q]] + self._foot.height[objects.category[upper[q]]]) < _FOOT
+        lowest = np.abs(self._under.height[own[q]] - self._foot.height[objects.category[upper[q]]]) < _FOOT
         points, met = np.concatenate([feet, tops], axis=1), np.concatenate([on_top, on_foot], axis=1) & lowest[:, None]
         for index in np.unique(upper[q]):
             mine = upper[q] == index
@@ -228,82 +228,6 @@ class Statics:
             way = np.outer(moved, (0.0, 0.0, 1.0))
             for met in self._collider.may_meet(objects, pairs, first[keep], second[keep], way, -_TOUCHING):
                 still[met[falling[met]]] = False
-
-
-def _rises(support: Index, drop: Array, fixed: Mask) -> tuple[Array, Index]:
-    """Upward motion (m) of each object until it meets its support, and the number of objects that carry it."""
-    rise, height = np.zeros(len(support)), np.zeros(len(support), dtype=np.int64)
-    carried = np.flatnonzero(support >= 0)
-    under = support[carried]
-    while True:
-        new_height = np.where(fixed[under], 1, height[under] + 1)
-        rise[carried] = rise[under] - drop[carried]
-        if (new_height == height[carried]).all() or new_height.max(initial=0) > len(support):
-            return rise, np.minimum(height, len(support))
-        height[carried] = new_height
-
-
-def _into(objects: Objects, rows: Index, points: Array) -> Array:
-    """World points (Q, K, 2) in the frames of upright objects ``rows`` (Q,)."""
-    relative = points - objects.translation[rows, None, :2]
-    r = objects.rotation[rows, :2, :2][:, None]
-    return r[..., 0, :] * relative[..., 0:1] + r[..., 1, :] * relative[..., 1:2]
-
-
-def _out_of(objects: Objects, rows: Index, points: Array) -> Array:
-    """Points (Q, K, 2) of upright objects ``rows`` (Q,) in the world."""
-    r = objects.rotation[rows, :2, :2][:, None]
-    moved = r[..., :, 0] * points[..., 0:1] + r[..., :, 1] * points[..., 1:2]
-    return moved + objects.translation[rows, None, :2]  # type: ignore[no-any-return]
-
-
-def _outline(points: Array) -> Array | None:
-    """Counter-clockwise convex outline (K, 2), or None when there is no area."""
-    outline = outline_of(points)
-    return outline if outline is not None and area(outline) > 1e-7 else None
-
-
-def _foot(asset: AssetGeometry) -> tuple[float, Array] | None:
-    """Height and outline of the lowest corners of all fine parts."""
-    vertices = asset.fine.vertices
-    height = float(vertices[:, 2].min())
-    outline = _outline(vertices[vertices[:, 2] < height + _FOOT][:, :2])
-    return None if outline is None else (height, outline)
-
-
-def _surface(vertices: Array) -> tuple[float, Array] | None:
-    """Height and outline of the flat top of the corners (V, 3) of a part or of all parts."""
-    height = float(vertices[:, 2].max())
-    outline = _outline(vertices[vertices[:, 2] > height - 1e-5][:, :2])
-    return None if outline is None else (height, outline)
-
-
-@dataclass(frozen=True, eq=False)
-class _Faces:
-    """Contact faces per category as arrays; NaN where there is none."""
-
-    height: Array
-    center: Array
-    inner: Array
-    corners: Array
-    hole: Array
-
-    @classmethod
-    def of(cls, faces: list[ContactFace | None]) -> _Faces:
-        def column(name: str) -> Array:
-            return np.array([np.nan if face is None else getattr(face, name) for face in faces])
-
-        center = np.array([(np.nan, np.nan) if face is None else face.center for face in faces])
-        return cls(column("height"), center, column("inner"), column("corners"), column("hole"))
-
-
-class Support:
-    """Test of contacts, from precomputed faces."""
-
-    def __init__(self, library: LibraryGeometry) -> None:
-        self.hollow = np.array([asset.is_hollow for asset in library.assets])
-        self.bottom = _Faces.of([asset.bottom for asset in library.assets])
-        self.top = _Faces.of([asset.top for asset in library.assets])
 
     def needs_fine(self, objects: Objects, pairs: ObjectPairs) -> Mask:
         """(n,) objects that must collide with their fine parts."""
@@ -366,6 +290,62 @@ class Support:
             if not objects.fixed[lower[index]]:
                 depth[upper[index]] = max(depth[upper[index]], depth[lower[index]] + 1)
         return depth
+
+
+def _rises(support: Index, drop: Array, fixed: Mask) -> tuple[Array, Index]:
+    """Upward motion (m) of each object until it meets its support, and the number of objects that carry it."""
+    rise, height = np.zeros(len(support)), np.zeros(len(support), dtype=np.int64)
+    carried = np.flatnonzero(support >= 0)
+    under = support[carried]
+    while True:
+        new_height = np.where(fixed[under], 1, height[under] + 1)
+        rise[carried] = rise[under] - drop[carried]
+        if (new_height == height[carried]).all() or new_height.max(initial=0) > len(support):
+            return rise, np.minimum(height, len(support))
+        height[carried] = new_height
+
+
+def _into(objects: Objects, rows: Index, points: Array) -> Array:
+    """World points (Q, K, 2) in the frames of upright objects ``rows`` (Q,)."""
+    relative = points - objects.translation[rows, None, :2]
+    r = objects.rotation[rows, :2, :2][:, None]
+    return r[..., 0, :] * relative[..., 0:1] + r[..., 1, :] * relative[..., 1:2]
+
+
+def _out_of(objects: Objects, rows: Index, points: Array) -> Array:
+    """Points (Q, K, 2) of upright objects ``rows`` (Q,) in the world."""
+    r = objects.rotation[rows, :2, :2][:, None]
+    moved = r[..., :, 0] * points[..., 0:1] + r[..., :, 1] * points[..., 1:2]
+    return moved + objects.translation[rows, None, :2]  # type: ignore[no-any-return]
+
+
+def _outline(points: Array) -> Array | None:
+    """Counter-clockwise convex outline (K, 2), or None when there is no area."""
+    outline = outline_of(points)
+    return outline if outline is not None and area(outline) > 1e-7 else None
+
+
+def _surface(vertices: Array, depth: float = 1e-5) -> tuple[float, Array] | None:
+    """Height and outline of the flat top of the corners (V, 3) of a part or of all parts, ``depth`` (m) thick."""
+    height = float(vertices[:, 2].max())
+    outline = _outline(vertices[vertices[:, 2] > height - depth][:, :2])
+    return None if outline is None else (height, outline)
+
+
+@dataclass(frozen=True, eq=False)
+class _Faces:
+    """Contact faces per category as arrays; NaN where there is none."""
+
+    height: Array
+    center: Array
+    inner: Array
+    corners: Array
+    hole: Array
+
+    @classmethod
+    def of(cls, faces: list[ContactFace | None]) -> _Faces:
+        none = ContactFace(np.nan, (np.nan, np.nan), np.nan, np.nan, np.nan)
+        return cls(*(np.array([getattr(face or none, field.name) for face in faces]) for field in fields(cls)))
 
 
 def clusters(objects: Objects, low: Array, high: Array) -> Index:

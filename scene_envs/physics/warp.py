@@ -24,7 +24,6 @@ from torch import Tensor
 
 from scene_envs.arrays import Array
 from scene_envs.errors import InvalidInputError, MissingDependencyError
-from scene_envs.physics.engines import gravity
 from scene_envs.physics.mujoco import TIMESTEP, add_parts, scene_spec
 from scene_envs.physics.parts import library_geometry
 from scene_envs.rotations import matrix_to_quaternion, quaternion_to_matrix
@@ -75,12 +74,6 @@ class Overlaps:
     depth: Tensor
     normal: Tensor
     valid: Tensor
-
-
-@cache
-def warp_engine(scene_type: SceneType, device: str | torch.device = "cuda") -> WarpEngine:
-    """The engine of a scene type on a device, made on first use and kept by this process; see :class:`WarpEngine`."""
-    return WarpEngine(scene_type, device)
 
 
 class WarpEngine:
@@ -234,33 +227,22 @@ class WarpEngine:
         normal[world[best]] = away[best]
         return depth[:count], normal[:count]
 
-    def simulate(
-        self,
-        batch: SceneBatch,
-        duration: float,
-        *,
-        tilt: tuple[float, float] = (0.0, 0.0),
-        damping: float = 0.0,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def simulate(self, batch: SceneBatch, duration: float) -> tuple[Tensor, Tensor, Tensor]:
         """Motion of every scene under gravity; independent of slots.
 
         Args:
             batch: B scenes of N slots; welded objects stay where they are.
             duration: Simulated time, s; steps of 2 ms.
-            tilt: Angles (x, y), rad, by which gravity is tilted.
-            damping: Fraction of velocity that objects lose per second.
 
         Returns:
             Translations (B, N, 3) m and rotations (B, N, 3, 3) float32 at the end, and validity (B,) bool: False, and
             poses unchanged, where a pose is not finite, the simulation diverged, or more contacts arose than fit.
 
         Raises:
-            InvalidInputError: the duration is not a positive number, or the damping is not in [0, 1).
+            InvalidInputError: the duration is not a positive number.
         """
         if not 0 < duration < math.inf:
             raise InvalidInputError(f"duration={duration} must be a positive number of seconds")
-        if not 0 <= damping < 1:
-            raise InvalidInputError(f"damping={damping} must be at least 0 and below 1")
         with self._scope():
             state = _State(batch, self._library)
             translation, rotation = state.translation.clone(), state.rotation.clone()
@@ -269,7 +251,7 @@ class WarpEngine:
             open_rows = [(rows, _ROOM) for rows in _chunks(len(batch), _SCENE_WORLDS[self.device.type], self.device)]
             while open_rows:
                 rows, room = open_rows.pop()
-                moved = self._launch_scenes(plan, rows, room, steps, gravity(tilt), -math.log1p(-damping))
+                moved = self._launch_scenes(plan, rows, room, steps)
                 if moved is None:  # one scene that is too much alone stays invalid
                     open_rows += [(half, room) for half in rows.chunk(2)[::-1] if len(rows) > 1]
                     continue
@@ -285,7 +267,7 @@ class WarpEngine:
         return translation.float(), rotation.float(), valid
 
     def _launch_scenes(
-        self, plan: _Plan, rows: Tensor, room: int, steps: int, down: Array, damping: float
+        self, plan: _Plan, rows: Tensor, room: int, steps: int
     ) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
         """Asset frames (w, S, 3), (w, S, 3, 3) of the free objects after some steps, whether (w,) they are finite, and
         whether (w,) a scene had more than ``room`` contacts; None where there were too many in all.
@@ -296,8 +278,7 @@ class WarpEngine:
         host, m = self._model(*plan.sizes, multiple=True)
         free = category[:, fixed:]
         library.fill(wp, m, category[:, plan.column], plan.part, most)
-        library.fill_bodies(wp, m, free, most, damping)
-        wp.to_torch(m.opt.gravity)[:] = torch.tensor(down, dtype=torch.float32, device=self.device)
+        library.fill_bodies(wp, m, free, most)
         present, free = free >= 0, free.clamp(min=0)
         turn = plan.rotation[rows, fixed:] @ library.axes[free]
         center = plan.translation[rows, fixed:] + _turned(plan.rotation[rows, fixed:], library.center_of_mass[free])
@@ -379,6 +360,10 @@ class WarpEngine:
             _LOGGER.info("MuJoCo Warp compiles its kernels, once, about a minute; they are kept in %s", folder)
         yield
         mark.touch()
+
+
+warp_engine = cache(WarpEngine)
+"""The engine of a scene type on a device, made on first use and kept by this process."""
 
 
 @cache
@@ -498,16 +483,12 @@ class _Library:
         for name in (*names, "npolygonmax", "nmeshdegmax"):
             setattr(model, name, getattr(self._meshes, name))
 
-    def fill_bodies(self, wp: Any, model: Any, category: Tensor, rows: int, damping: float) -> None:
-        """Set masses of free bodies of category (w, S), or -1, in ``rows`` worlds; a body's frame is its inertia's.
-
-        ``damping`` is the rate (1/s) at which velocities decay.
-        """
+    def fill_bodies(self, wp: Any, model: Any, category: Tensor, rows: int) -> None:
+        """Set masses of free bodies of category (w, S), or -1, in ``rows`` worlds; a body's frame is its inertia's."""
         missing, category = category < 0, category.clamp(min=0)
         mass = self.mass[category].masked_fill(missing, 1.0)
         moments = self.moments[category].masked_fill(missing[..., None], 1.0)
         inverse = torch.stack([1 / mass, (1 / moments).mean(dim=-1)], dim=-1)
-        dofs = torch.cat([mass[..., None].expand_as(moments), moments], dim=-1).flatten(1)
 
         def put(name: str, values: Tensor, dtype: Any, world: float | None = None) -> None:
             if world is not None:  # the world is body 0
@@ -520,7 +501,6 @@ class _Library:
         put("body_subtreemass", mass, wp.float32, 0.0)
         wp.to_torch(model.body_subtreemass)[: len(mass), 0] = mass.sum(dim=1).float()
         put("dof_invweight0", inverse.repeat_interleave(3, dim=-1).flatten(1), wp.float32)
-        put("dof_damping", damping * dofs, wp.float32)
 
     def fill(self, wp: Any, model: Any, category: Tensor, part: Tensor, rows: int) -> None:
         """Set geometries of a model in ``rows`` >= w worlds: part number (G,) of assets of category (w, G), or -1."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,6 @@ class Stage:
 
     def __init__(self, names: tuple[str, ...], folders: tuple[str, ...] = ()) -> None:
         self._library = get_library(names, folders)
-        self._models: dict[int, _Model] = {}
         self.place(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
 
     def place(self, translations: Array, rotations: Array, categories: Index) -> None:
@@ -63,7 +62,7 @@ class Stage:
         # In an order that does not depend on slots, which decides between surfaces at the same place
         order = np.lexsort((*translations.T, categories))
         slots = [slot for slot in order.tolist() if 0 <= categories[slot] < len(self._library)]
-        models = [self._model(int(categories[slot])) for slot in slots]
+        models = [_model(self._library[int(categories[slot])]) for slot in slots]
         starts = np.cumsum([0, *(len(model.vertices) for model in models)])
         placed = [(model, rotations[slot].T, translations[slot]) for slot, model in zip(slots, models, strict=True)]
         none = np.empty((0, 3))
@@ -136,25 +135,20 @@ class Stage:
         view = camera.view
         return self._vertices @ view[:3, :3].T + view[:3, 3]
 
-    def _model(self, category: int) -> _Model:
-        if category not in self._models:
-            asset = self._library[category]
-            mesh = asset.visual
-            self._models[category] = _Model(
-                np.asarray(mesh.vertices, dtype=np.float64),
-                np.asarray(mesh.vertex_normals, dtype=np.float64),
-                vertex_colors(asset).astype(np.float64),
-                np.asarray(mesh.faces, dtype=np.int64),
-            )
-        return self._models[category]
 
-
-@dataclass(frozen=True)
-class _Model:
+class _Model(NamedTuple):
     vertices: Array  # (V, 3), m
     normals: Array  # (V, 3), unit vectors
     colors: Array  # (V, 3), 0..255
     faces: Index  # (F, 3)
+
+
+@cache
+def _model(asset: Asset) -> _Model:
+    mesh = asset.visual
+    columns = mesh.vertices, mesh.vertex_normals, vertex_colors(asset)
+    vertices, normals, colors = (np.array(column, dtype=np.float64) for column in columns)
+    return _Model(vertices, normals, colors, np.array(mesh.faces, dtype=np.int64))
 
 
 get_stage = cache(Stage)

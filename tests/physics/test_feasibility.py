@@ -135,7 +135,7 @@ def test_coarse_shapes_give_the_verdict_of_fine_ones(monkeypatch: pytest.MonkeyP
     """At most one object in a hundred differs, over scenes at rest and jittered ones."""
     batch = SceneBatch.concatenate([dimsum(3, 6), jittered(dimsum(3, 7), 1)])
     mixed = feasibility(batch)
-    support = physics_of(batch.scene_type, "bullet").support
+    support = physics_of(batch.scene_type, "bullet").statics
     monkeypatch.setattr(support, "needs_fine", lambda objects, pairs: support.hollow[objects.category])
     fine = feasibility(batch)
     assert int((mixed.feasible != fine.feasible).sum()) <= 0.01 * int(batch.is_free.sum())

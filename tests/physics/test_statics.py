@@ -30,7 +30,7 @@ def simulated(batch: SceneBatch, monkeypatch: pytest.MonkeyPatch, **options: Any
     def nothing(self: Physics, objects: Objects, pairs: ObjectPairs, duration: float) -> Rest:
         return Rest(np.zeros(len(objects), bool), np.zeros(len(objects)), np.zeros(len(objects)))
 
-    support = physics_of(batch.scene_type, "bullet").support
+    support = physics_of(batch.scene_type, "bullet").statics
     with monkeypatch.context() as patch:
         patch.setattr(Physics, "rest", nothing)
         patch.setattr(support, "needs_fine", lambda objects, pairs: support.hollow[objects.category])

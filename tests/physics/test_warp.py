@@ -109,20 +109,6 @@ def test_motion_does_not_depend_on_slots_and_stacks_stand(engine: WarpEngine) ->
     assert (one - batch.translations)[0, :3].abs().max() < 1e-5
 
 
-def test_tilted_gravity_and_damping_have_closed_forms(engine: WarpEngine) -> None:
-    batch = scene(("cube", 0.0, 0.0, 1.0))
-    steps = 50
-    tilted, _, _ = engine.simulate(batch, steps * TIMESTEP, tilt=(0.1, 0.0))
-    along = GRAVITY * np.sin(0.1) * TIMESTEP**2 * steps * (steps + 1) / 2
-    assert tilted[0, 1, 0] == pytest.approx(along, abs=2e-6)
-    slow, _, _ = engine.simulate(batch, steps * TIMESTEP, damping=0.9)
-    speed = height = 0.0
-    for _ in range(steps):  # v' = -g - c v, implicit in v
-        speed = (speed - GRAVITY * TIMESTEP) / (1 - np.log1p(-0.9) * TIMESTEP)
-        height += speed * TIMESTEP
-    assert slow[0, 1, 2] - 1.0 == pytest.approx(height, abs=2e-6)
-
-
 def test_scenes_without_objects_are_answered(engine: WarpEngine) -> None:
     batch = SceneBatch.empty(TYPE, 2)
     assert listed(engine.overlaps(batch)) == {}
@@ -138,8 +124,6 @@ def test_wrong_arguments_are_named(engine: WarpEngine) -> None:
     batch = SceneBatch.empty(TYPE, 1)
     with pytest.raises(InvalidInputError, match="duration=0"):
         engine.simulate(batch, 0)
-    with pytest.raises(InvalidInputError, match="damping=1"):
-        engine.simulate(batch, 0.1, damping=1.0)
     if not torch.cuda.is_available():
         with pytest.raises(InvalidInputError, match="'cuda'"):
             warp_engine(TYPE, "cuda")

@@ -1,10 +1,10 @@
-"""Assets whose shapes are a table, ``tables.json``: ware, furniture, toys and games of boxes and solids of revolution.
+"""Built-in assets, whose shapes are a table, ``tables.json``.
 
 An entry holds the facts of :func:`~scene_envs.assets.base.asset_recipe` and rows of shapes. The first key of a row
-names a function of :mod:`scene_envs.assets.shapes` and gives its first argument, the others are keywords; ``at`` lists
-the places (x, y, z) m of a box, ``turn`` (3, 3) and ``to`` (3,) m are the pose of a lathed surface. ``coarse`` holds
-numbers of rows, for their parts, and lists of such numbers, for hulls of them; without it, the coarse parts are the
-fine ones. Colours are ``#rrggbb``, lengths m, angles rad.
+names a function of :mod:`scene_envs.assets.shapes` or of :mod:`scene_envs.assets.recipes.painted` and gives its first
+argument, the others are keywords; ``at`` lists the places (x, y, z) m of a box, or of a mesh that ``turn`` (3, 3)
+rotates. ``coarse`` holds numbers of rows, for their parts, and lists of such numbers, for hulls of them; without it,
+the coarse parts are the fine ones. Colours are ``#rrggbb``, lengths m, angles rad.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from typing import Any
 import trimesh
 
 from scene_envs.assets.base import ConvexPart, Model, asset_recipe
+from scene_envs.assets.recipes.painted import bar, barrel, beam, printed, prism, revolve, scoop, slabs, sleeve
 from scene_envs.assets.shapes import (
     FACES,
     Patch,
-    arc,
     box,
     convex_hull,
     hull_of,
@@ -32,13 +32,14 @@ from scene_envs.assets.shapes import (
     planks,
     ring,
     rods,
+    sheet,
     solid,
+    tiles,
     tube,
 )
 
-
-def _tube(path: Any, samples: int, radii: Any, color: Any) -> trimesh.Trimesh:
-    return tube(arc(path, samples), radii, color)
+_PARTS = {"box": box, "hull": convex_hull, "solid": solid, "ring": ring, "rods": rods, "beam": beam}
+_PATCHES: dict[str, Any] = {"lettering": lettering, "tiles": tiles}
 
 
 def _painted(size: Any, color: Any, art: Any = None, **rest: Any) -> trimesh.Trimesh:
@@ -46,14 +47,16 @@ def _painted(size: Any, color: Any, art: Any = None, **rest: Any) -> trimesh.Tri
     colors: Any = {face: color.get(face, color.get("sides")) for face in FACES} if isinstance(color, dict) else color
     drawn = {face: art.get(face, art.get("sides", ()) if face in FACES[:4] else ()) for face in FACES} if art else {}
     patches: Any = {
-        face: [patch for row in rows for patch in (lettering(*row[1:]) if row[0] == "lettering" else [Patch(*row)])]
+        face: [patch for row in rows for patch in (_PATCHES[row[0]](*row[1:]) if row[0] in _PATCHES else [Patch(*row)])]
         for face, rows in drawn.items()
     }
     return painted_box(size, colors, patches, **rest)
 
 
-_PARTS = {"box": box, "convex_hull": convex_hull, "solid": solid, "ring": ring, "rods": rods}
-_LOOKS = {"lathe": lathe, "tube": _tube, "planks": planks, "painted_box": _painted}
+_LOOKS: dict[str, Any] = {
+    "painted_box": _painted, "lathe": lathe, "tube": tube, "planks": planks, "sheet": sheet, "revolve": revolve,
+    "sleeve": sleeve, "slabs": slabs, "print": printed, "bar": bar, "scoop": scoop, "prism": prism, "barrel": barrel,
+}  # fmt: skip
 
 
 def _decoded(value: Any) -> Any:
@@ -69,10 +72,11 @@ def _made(row: dict[str, Any], makers: dict[str, Any]) -> list[Any]:
     """What a row makes, at each of its places."""
     (name, first), *rest = _decoded(row).items()
     options = dict(rest)
-    turn, to = options.pop("turn", None), options.pop("to", None)
-    bases = [{"base": place} for place in options.pop("at", ())] or [{}]
+    places, turn = options.pop("at", ()), options.pop("turn", None)
+    if turn is not None:
+        return [moved(makers[name](first, **options), turn, place) for place in places]
+    bases = [{"base": place} for place in places] or [{}]
     found = [makers[name](first, **options, **base) for base in bases]
-    found = found if turn is None else [moved(mesh, turn, to) for mesh in found]
     return found[0] if isinstance(found[0], list) else found
 
 
