@@ -114,6 +114,7 @@ def sphere(folder: Path, name: str, subdivisions: int) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("new_interpreters")
 def test_a_stage_is_ended_when_the_time_of_the_file_is_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = sphere(tmp_path, "sphere.stl", 5)
     assert path.stat().st_size > READ_HERE
