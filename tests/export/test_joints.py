@@ -327,6 +327,12 @@ def test_a_free_asset_stays_frozen_unless_its_scene_type_welds_it(tmp_path: Path
     assert (model.nbody, model.njnt) == (6, 3)
 
 
+def test_limits_may_be_infinite_in_all_spellings_of_a_number(tmp_path: Path) -> None:
+    for low, high in (("-inf", "inf"), ("-INF", "+Infinity"), ("-1e16", "1e17")):
+        scenes(tmp_path / "own", "cabinet.urdf", urdf(f'<limit lower="{low}" upper="{high}"/>'))
+        assert load_library(tmp_path / "own")["cabinet"].joints[0].limits == (-np.inf, np.inf)
+
+
 def test_scale_and_up_move_the_joints_with_the_asset(tmp_path: Path) -> None:
     scenes(tmp_path / "own", "cabinet.urdf", urdf(), "welded: true")
     plain = load_library(tmp_path / "own")["cabinet"]
@@ -420,6 +426,11 @@ def test_what_cannot_move_is_frozen_and_named(tmp_path: Path, file: str, text: s
         ("", "joint 'hinge' is revolute and has no <limit>; give it lower and upper, or make it continuous or fixed"),
         ('<limit lower="1" upper="-1"/>', "joint 'hinge' has a lower limit of 1 above its upper one of -1; exchange"),
         ('<limit lower="none"/>', "lower of joint 'hinge' is 'none', which is not numbers"),
+        (
+            '<limit upper="1"/><dynamics damping="inf"/>',
+            "the axis [0.0, 0.0, 1.0], damping and friction (inf, 0.0)",
+        ),
+        ('<limit lower="-none.inf" upper="1"/>', "lower of joint 'hinge' is '-none.inf', which is not numbers"),
     ],
 )
 def test_wrong_limits_are_an_error_of_a_welded_asset(tmp_path: Path, hinge: str, words: str) -> None:
