@@ -23,6 +23,8 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml
+
 from scene_envs.errors import CorruptFileError, InvalidInputError, StorageError
 
 if TYPE_CHECKING:
@@ -158,6 +160,20 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise CorruptFileError(f"{str(path)!r} holds no mapping")
     return without_digest(content, path)
+
+
+class _Loader(yaml.SafeLoader):
+    """As YAML 1.2, in which 1e-3 is a number."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
+def read_yaml(path: Path) -> Any:
+    """The content of a YAML file; None for an empty one. Raises OSError, UnicodeDecodeError and yaml.YAMLError."""
+    return yaml.load(path.read_text(encoding="utf-8"), _Loader)
 
 
 def _digest_of(content: Any) -> str:

@@ -49,10 +49,10 @@ def regular_plural(name: str) -> str:
 
 
 def identifiers(names: Iterable[str]) -> dict[str, str]:
-    """For each name, a unique identifier of letters, digits and underscores that does not start with a digit.
+    """For each name, a unique :func:`identifier`.
 
-    >>> identifiers(["tea cup", "tea-cup", "7up", "plate"])
-    {'tea cup': 'tea_cup', 'tea-cup': 'tea_cup_2', '7up': '_7up', 'plate': 'plate'}
+    >>> identifiers(["tea cup", "tea-cup", "7up", "world", "__lid__"])
+    {'tea cup': 'tea_cup', 'tea-cup': 'tea_cup_2', '7up': '_7up', 'world': '_world', '__lid__': '_lid_'}
     """
     found: dict[str, str] = {}
     for name in names:
@@ -65,9 +65,11 @@ def identifiers(names: Iterable[str]) -> dict[str, str]:
 
 
 def identifier(name: str) -> str:
-    """``name`` with everything but letters, digits and underscores replaced; it does not start with a digit."""
-    plain = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
-    return f"_{plain}" if plain[0].isdigit() else plain
+    """``name`` with everything but letters, digits and underscores replaced. It does not start with a digit, and is no
+    word that formats keep for themselves, such as ``world`` and ``__model__``.
+    """
+    plain = re.sub(r"^__+(.+?)__+$", r"_\1_", re.sub(r"\W", "_", name, flags=re.ASCII)) or "_"
+    return f"_{plain}" if plain[0].isdigit() or plain == "world" else plain
 
 
 @dataclass(frozen=True)

@@ -171,7 +171,7 @@ def _digest(batch: SceneBatch) -> str:
     """Digest of the poses, and of the geometry and mass of the assets."""
     digest = hashlib.sha256(batch.tensor.cpu().contiguous().numpy().tobytes())
     digest.update(repr((batch.scene_type.assets, batch.scene_type.welded)).encode())
-    for asset in batch.scene_type.library:
+    for asset in (one for each in batch.scene_type.library for one in (each, *each.bodies)):
         digest.update(repr((asset.name, asset.mass, asset.static)).encode())
         digest.update(asset.inertia.tobytes() + asset.center_of_mass.tobytes())
         for part in asset.fine:

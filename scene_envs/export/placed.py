@@ -53,8 +53,8 @@ class Light:
 
     def __post_init__(self) -> None:
         length = float(np.linalg.norm(self.direction))
-        if not length > 1e-9:
-            raise InvalidInputError(f"a lamp shines in no direction: {self.direction} has no length")
+        if not 1e-9 < length < np.inf:
+            raise InvalidInputError(f"a lamp shines in no direction: {self.direction} has a length of {length:g}")
         object.__setattr__(self, "direction", tuple(x / length for x in self.direction))
 
 

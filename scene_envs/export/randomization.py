@@ -14,10 +14,11 @@ import yaml
 
 from scene_envs.errors import InvalidInputError
 from scene_envs.export.placed import TEXTURES, PlacedScene
+from scene_envs.files import read_yaml
 from scene_envs.render.raster import Pinhole
 
-DISTRIBUTIONS = ("uniform", "normal", "lognormal", "triangular")
-"""Of numpy's generator, with its arguments in its order; a texture has ``choice`` and the names to choose from."""
+DISTRIBUTIONS = {"uniform": 2, "normal": 2, "lognormal": 2, "triangular": 3}
+"""Of numpy's generator, with the number of its arguments; a texture has ``choice`` and the names to choose from."""
 KEYS = {
     "mass": "factor of mass and inertia; masses are in kg",
     "friction": "coefficient of friction",
@@ -44,24 +45,32 @@ def read_randomization(source: str | os.PathLike[str] | Mapping[str, Any]) -> di
     """Settings from a YAML file or a mapping: ``seed``, and for some of ``KEYS`` one distribution with its arguments;
     nothing for an empty source.
 
-    Raises InvalidInputError for a file that cannot be read, and for unknown keys, distributions and textures.
+    Raises InvalidInputError for a file that cannot be read or holds no mapping, for unknown keys, distributions and
+    textures, and for other arguments.
 
     >>> read_randomization({"mass": {"uniform": [0.8, 1.2]}})
     {'seed': 0, 'mass': {'uniform': [0.8, 1.2]}}
     """
+    place = ""
     try:
         if not source:
             return {}
-        found = source if isinstance(source, Mapping) else yaml.safe_load(Path(source).read_text(encoding="utf-8"))
+        found = source if isinstance(source, Mapping) else read_yaml(Path(source))
+        if not isinstance(found, Mapping):
+            raise ValueError("it is empty" if found is None else f"it holds {found!r}, not keys with distributions")
         settings: dict[str, Any] = json.loads(json.dumps({"seed": 0, **found}))  # as a manifest holds them
-        np.random.default_rng(settings["seed"])
+        seed = settings["seed"]
+        if type(seed) is not int or seed < 0:
+            raise ValueError(f"seed={seed!r} must be a non-negative whole number")
         for key in settings.keys() - {"seed"}:
             if key not in KEYS:
                 raise ValueError(f"unknown key {key!r}")
+            place = f"{key}: "
+            _check(settings[key], ("choice",) if key == "texture" else DISTRIBUTIONS)
             _draw(settings, key, 1, [])
-    except (OSError, ValueError, TypeError, AttributeError, OverflowError, yaml.YAMLError) as error:
+    except (OSError, ValueError, TypeError, OverflowError, yaml.YAMLError) as error:
         raise InvalidInputError(
-            f"randomization={str(source)[:200]!r}: {' '.join(str(error).split())}; write seed: 0 and some of "
+            f"randomization={str(source)[:200]!r}: {place}{' '.join(str(error).split())}; write seed: 0 and some of "
             f"{', '.join(KEYS)} as mass: {{uniform: [0.8, 1.2]}}, with one of {', '.join(DISTRIBUTIONS)}, or as "
             f"texture: {{choice: [{', '.join(TEXTURES)}]}}"
         ) from error
@@ -122,15 +131,26 @@ def _color(values: Any) -> tuple[float, ...]:
     return tuple(np.clip(values, 0.0, 1.0).tolist())
 
 
+def _check(given: Any, known: Iterable[str]) -> None:
+    """Raise ValueError for what is not one of the known distributions with its arguments."""
+    pairs = [*given.items()] if isinstance(given, dict) else []
+    if len(pairs) != 1 or not isinstance(pairs[0][1], list):
+        raise ValueError(f"{given!r} is not one distribution with the list of its arguments")
+    ((name, values),) = pairs
+    if name not in known:
+        raise ValueError(f"unknown distribution {name!r}")
+    if name == "choice":
+        if strange := {*map(str, values)} - {*TEXTURES}:
+            raise ValueError(f"unknown {', '.join(sorted(strange))}")
+    elif [type(value) in (int, float) for value in values] != [True] * DISTRIBUTIONS[name]:
+        raise ValueError(f"{name} takes {DISTRIBUTIONS[name]} numbers, got {values}")
+
+
 def _draw(settings: Mapping[str, Any], key: str, count: int, numbers: list[int]) -> Any:
     """(count, 3) draws, or (count,) lists of one each; each key has its own stream."""
     ((name, values),) = settings[key].items()
     rng = np.random.default_rng([settings["seed"], _NAMES.index(key), *numbers])
-    if name not in (("choice",) if key == "texture" else DISTRIBUTIONS):
-        raise ValueError(f"{key}: unknown distribution {name!r}")
-    if key == "texture" and (strange := {*values} - {*TEXTURES}):
-        raise ValueError(f"texture: unknown {', '.join(sorted(map(str, strange)))}")
     drawn = rng.choice(values, size=(count, 3)) if key == "texture" else getattr(rng, name)(*values, size=(count, 3))
     if key != "texture" and not np.isfinite(drawn).all():
-        raise InvalidInputError(f"{key}: {name}: {values} draws numbers that are not finite")
+        raise InvalidInputError(f"randomization: {key}: {name}: {values} draws numbers that are not finite")
     return drawn if key in _VECTORS else drawn[:, 0].astype(object)

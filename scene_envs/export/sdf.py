@@ -35,15 +35,15 @@ def _add_model(world: ET.Element, item: PlacedObject, files: AssetFiles, folder:
     if item.welded and not item.joints:
         _text(model, "static", "true")
     names = [files.name(item.asset), *(joint.link for joint in item.joints)]
-    _add_link(model, names[0], item.pieces[0], files, folder)
-    for index, (joint, piece) in enumerate(zip(item.joints, item.pieces[1:], strict=True)):
-        _text(_add_link(model, joint.link, piece, files, folder), "pose", _pose(item.frames[index + 1]))
-        if not index:  # a static model has no joints that move
-            _add_joint(model, f"{item.name}_weld", "fixed", "world", names[0])
-        name = joint.name + "_joint" * (joint.name in names)  # joints and links share their names
+    links = [_add_link(model, *each, files, folder) for each in zip(names, item.pieces, strict=True)]
+    for link, frame in zip(links[1:], item.frames[1:], strict=True):
+        _text(link, "pose", _pose(frame))
+    if item.joints:  # a static model has no joints that move
+        _add_joint(model, f"{item.name}_weld", "fixed", "world", names[0])
+    for joint in item.joints:
         is_endless = np.isinf(joint.limits[0])
         kind = "continuous" if is_endless else joint.kind
-        axis = ET.SubElement(_add_joint(model, name, kind, names[joint.parent], joint.link), "axis")
+        axis = ET.SubElement(_add_joint(model, joint.name, kind, names[joint.parent], joint.link), "axis")
         _text(axis, "xyz", numbers(joint.axis))
         dynamics, limit = ET.SubElement(axis, "dynamics"), ET.SubElement(axis, "limit")
         _text(dynamics, "damping", number(joint.damping))
@@ -57,6 +57,8 @@ def _pose(matrix: Array) -> str:
 
 
 def _add_joint(model: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
+    while any(element.get("name") == name for element in model):  # links and joints share their names
+        name += "_joint"
     joint = ET.SubElement(model, "joint", name=name, type=kind)
     _text(joint, "parent", parent)
     _text(joint, "child", child)

@@ -214,6 +214,7 @@ def test_class_colors_differ_from_each_other_and_from_the_built_in_ones(tmp_path
     [
         ("- {file: brick.stl, densty: 4}", "unknown key 'densty'; did you mean 'density'"),
         ("- {file: brick.stl, scale: 0}", "(brick.stl): scale=0 must be a positive number"),
+        ("- {file: brick.stl, scale: -1e-3}", "scale=-0.001 must be a positive number"),
         ("- {file: brick.stl, scale: -1}", "scale=-1 must be a positive number"),
         ("- {file: brick.stl, mass: heavy}", "mass='heavy' must be a positive number"),
         ("- {file: brick.stl, mass: .nan}", "mass=nan must be a positive number"),

@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from scene_envs.assets import import_report, load_library
-from scene_envs.errors import CorruptFileError
+from scene_envs.errors import CorruptFileError, InvalidInputError
 from scene_envs.export import ExportReport, export, verify
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import Camera, FixedObject, SceneType, register_scene_type
@@ -327,6 +327,12 @@ def test_a_free_asset_stays_frozen_unless_its_scene_type_welds_it(tmp_path: Path
     assert (model.nbody, model.njnt) == (6, 3)
 
 
+def test_limits_may_be_infinite_in_all_spellings_of_a_number(tmp_path: Path) -> None:
+    for low, high in (("-inf", "inf"), ("-INF", "+Infinity"), ("-1e16", "1e17")):
+        scenes(tmp_path / "own", "cabinet.urdf", urdf(f'<limit lower="{low}" upper="{high}"/>'))
+        assert load_library(tmp_path / "own")["cabinet"].joints[0].limits == (-np.inf, np.inf)
+
+
 def test_scale_and_up_move_the_joints_with_the_asset(tmp_path: Path) -> None:
     scenes(tmp_path / "own", "cabinet.urdf", urdf(), "welded: true")
     plain = load_library(tmp_path / "own")["cabinet"]
@@ -340,6 +346,34 @@ def test_scale_and_up_move_the_joints_with_the_asset(tmp_path: Path) -> None:
         far.pose[:3, 3] - wide.pose[:3, 3], 2 * turn @ (slide.pose - hinge.pose)[:3, 3], atol=1e-9
     )
     assert large.bodies[2].mass == pytest.approx(8 * plain.bodies[2].mass)
+
+
+def test_links_may_have_the_names_that_exports_give(tmp_path: Path) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    pytest.importorskip("pydrake")
+    text, found = urdf(), []
+    for link in ("door", "tray", "lid"):
+        new = {"door": "base", "tray": "cabinet", "lid": "__lid__"}[link]
+        text = text.replace(f'name="{link}"', f'name="{new}"').replace(f'link="{link}"', f'link="{new}"')
+    text = text.replace('name="slide"', 'name="cabinet_0_weld"')
+    for number, words in enumerate((urdf(), text)):
+        batch = scenes(tmp_path / f"own{number}", "cabinet.urdf", words)
+        out = tmp_path / f"out{number}"
+        report = export(batch, out, ["mjcf", "sdf", "drake"])
+        found.append(mujoco.MjModel.from_xml_path(str(report.scenes[0]["mjcf"])))
+        for file in ("world.sdf", "scene.dmd.yaml"):
+            assert len(in_drake(out / "scene_000" / file, "cabinet_0", package=out / "package.xml")({})) == 4
+    np.testing.assert_allclose(found[1].geom_aabb, found[0].geom_aabb, atol=1e-12)
+    np.testing.assert_array_equal(found[1].body_mass, found[0].body_mass)
+    names = [found[1].body(row).name.rpartition("/")[2] for row in range(2, found[1].nbody)]
+    assert names == ["cabinet_0", "base_2", "cabinet_2", "_lid_"]
+
+
+def test_an_export_of_other_links_is_refused(tmp_path: Path) -> None:
+    export(scenes(tmp_path / "own", "cabinet.urdf", urdf()), tmp_path / "out", "mjcf")
+    heavier = scenes(tmp_path / "own", "cabinet.urdf", urdf().replace('mass value="2"', 'mass value="2.5"'))
+    with pytest.raises(InvalidInputError, match="holds an export of other scenes"):
+        export(heavier, tmp_path / "out", "urdf")
 
 
 BALL = '<joint name="b" type="{}"><parent link="back"/><child link="more"/>{}</joint><link name="more">' + shapes(
@@ -392,6 +426,11 @@ def test_what_cannot_move_is_frozen_and_named(tmp_path: Path, file: str, text: s
         ("", "joint 'hinge' is revolute and has no <limit>; give it lower and upper, or make it continuous or fixed"),
         ('<limit lower="1" upper="-1"/>', "joint 'hinge' has a lower limit of 1 above its upper one of -1; exchange"),
         ('<limit lower="none"/>', "lower of joint 'hinge' is 'none', which is not numbers"),
+        (
+            '<limit upper="1"/><dynamics damping="inf"/>',
+            "the axis [0.0, 0.0, 1.0], damping and friction (inf, 0.0)",
+        ),
+        ('<limit lower="-none.inf" upper="1"/>', "lower of joint 'hinge' is '-none.inf', which is not numbers"),
     ],
 )
 def test_wrong_limits_are_an_error_of_a_welded_asset(tmp_path: Path, hinge: str, words: str) -> None:

@@ -408,11 +408,35 @@ def test_worlds_hold_what_the_json_says(tmp_path):
         ({"mass": {"uniform": [0, float("inf")]}}, "range exceeds valid bounds"),
         ({"mass": {"uniform": np.array([1.0, 2.0])}}, "not JSON serializable"),
         ({"seed": -1}, "non-negative"),
+        ({"mass": {"uniform": [2, 1]}}, "mass: high - low < 0"),
+        ({"seed": [1, 2]}, r"seed=\[1, 2\] must be"),
+        ({"mass": {"uniform": [0.8]}}, r"mass: uniform takes 2 numbers, got \[0.8\]"),
+        ({"mass": {"uniform": [1, 2, 3]}}, "mass: uniform takes 2 numbers"),
+        ({"friction": {"triangular": [0.2, 0.5]}}, "friction: triangular takes 3 numbers"),
+        ({"mass": {"uniform": [[1, 2, 3], [2, 3, 4]]}}, "mass: uniform takes 2 numbers"),
+        ({"mass": {"uniform": [True, 2]}}, "mass: uniform takes 2 numbers"),
+        ({"mass": {"uniform": {"low": 1, "high": 2}}}, "mass: {.*} is not one distribution with the list"),
+        ({"mass": {"uniform": [1, 2], "normal": [1, 2]}}, "mass: {.*} is not one distribution"),
+        ({"texture": {"choice": "checker"}}, "texture: {'choice': 'checker'} is not one distribution"),
+        ({"texture": {"choice": [["flat"], None]}}, "texture: unknown None, \\['flat'"),
     ],
 )
 def test_what_cannot_be_drawn_is_named(settings, message):
     with pytest.raises(InvalidInputError, match=message):
         read_randomization(settings)
+
+
+def test_a_file_is_read_as_it_is_meant(tmp_path):
+    path = tmp_path / "values.yaml"
+    path.write_text("mass: {uniform: [1e-3, 2.5E+0]}\nlight_direction: {normal: [-1e-1, .5e0]}\n")
+    found = read_randomization(path)
+    assert (found["mass"], found["light_direction"]) == ({"uniform": [0.001, 2.5]}, {"normal": [-0.1, 0.5]})
+    for text, message in (("", "it is empty"), ("# no keys\n", "it is empty"), ("- mass\n", r"it holds \['mass'\]")):
+        path.write_text(text)
+        with pytest.raises(InvalidInputError, match=message):
+            read_randomization(path)
+    with np.errstate(over="ignore"), pytest.raises(InvalidInputError, match="has a length of inf"):
+        export(laid_scene(), tmp_path / "a", "mjcf", randomization={"light_direction": {"uniform": [1e154, 1e154]}})
 
 
 def test_formats_join_a_randomized_export_and_other_values_are_named(tmp_path):

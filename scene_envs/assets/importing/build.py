@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from scene_envs.arrays import Array
-from scene_envs.assets.base import Asset, ConvexPart, Joint, bounds_of, identifier, identifiers, regular_plural
+from scene_envs.assets.base import Asset, ConvexPart, Joint, bounds_of, identifiers, regular_plural
 from scene_envs.assets.importing.limits import seconds_left
 from scene_envs.assets.importing.mesh_files import (
     MESH_SUFFIXES,
@@ -39,6 +39,7 @@ from scene_envs.assets.importing.solids import (
 )
 from scene_envs.assets.shapes import MassProperties, join, mass_properties, moved
 from scene_envs.errors import Checked, CorruptFileError, InvalidInputError, Limit, Positive, unknown_name
+from scene_envs.files import read_yaml
 
 if TYPE_CHECKING:
     import trimesh
@@ -103,7 +104,7 @@ def read_entries(path: Path) -> list[AssetEntry]:
     import yaml
 
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = read_yaml(path)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise CorruptFileError(f"{path} is not well-formed YAML: {' '.join(str(error).split())}") from error
     except OSError as error:
@@ -405,7 +406,8 @@ def _articulate(
             notes.append(f"movable joint frozen at zero: {joint.name} (it joins what has no shape)")
     if not kept:
         return (), ()
-    names = identifiers(model.joints[index - 1].link for index in kept)
+    taken = (entry.name, "joints", "base")  # names that exports give
+    names = identifiers([*taken, *(model.joints[index - 1].link for index in kept)])
     titles = identifiers(model.joints[index - 1].name for index in kept)
     joints, bodies, frames = list[Joint](), list[Asset](), [np.eye(4)]
     for row, index in enumerate([0, *kept]):
@@ -415,7 +417,6 @@ def _articulate(
             parent, link = rows[joint.parent], names[joint.link]
             pose = np.linalg.inv(frames[parent]) @ joint.pose
             pose[:3, 3] += 0.0 if parent else shift
-            link += "_link" * (link in (identifier(entry.name), "joints"))  # names that exports give
             joints.append(dataclasses.replace(joint, name=titles[joint.name], link=link, parent=parent, pose=pose))
         back: Any = np.linalg.inv(frames[row]) if row else pose_of(shift, np.eye(3))
         own = [piece for piece in pieces if rows[piece.link] == row]

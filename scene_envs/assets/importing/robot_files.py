@@ -103,9 +103,10 @@ class _Reading:
             return None
 
         def number(key: str, where_from: Element | None, default: float) -> float:
-            text = _text(where_from, key) or ""
-            plain = numbers(None if "inf" in text else text, 1, self.path, f"{key} of {where}", (default,))[0]
-            value = float(text) if text.strip(" +-") == "inf" else float(plain)
+            text = (_text(where_from, key) or "").strip()
+            if text.lower().lstrip("+-") in ("inf", "infinity"):
+                return float(text)
+            value = float(numbers(text, 1, self.path, f"{key} of {where}", (default,))[0])
             return value if abs(value) < 1e16 else float(np.copysign(np.inf, value))  # as SDFormat says
 
         default = (1.0, 0.0, 0.0) if is_urdf else (0.0, 0.0, 1.0)
@@ -119,7 +120,7 @@ class _Reading:
             fault = f"is {kind} and has no <limit>; give it lower and upper, or make it continuous or fixed"
         elif low > high:
             fault = f"has a lower limit of {low:g} above its upper one of {high:g}; exchange them"
-        elif not length or min(rubs) < 0:
+        elif not length or not 0.0 <= min(rubs) <= max(rubs) < np.inf:
             fault = f"has the axis {vector.tolist()}, damping and friction {rubs}; 0 0 1, 0 and 0 would do"
         else:
             moves: Literal["prismatic", "revolute"] = "prismatic" if kind == "prismatic" else "revolute"
