@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+from agents.configuration.composition import config_text
 from agents.post_training.report import (
     PHYSICS_TIMEOUT,
     SAMPLE_SEED,
@@ -122,7 +123,7 @@ def _write_page(directory: Path, runs: Mapping[str, _Finished], measured: Mappin
         left_out=left_out,
         pictures=pictures,
         rows=number_rows(figures),
-        settings={f"{name}: {key}": value for name, run in runs.items() for key, value in run.config.items()},
+        settings=config_text({name: run.config for name, run in runs.items()}),
     )
 
 
