@@ -112,11 +112,10 @@ def _write_page(directory: Path, runs: Mapping[str, _Finished], measured: Mappin
         ready = {name: (part.ready, part.is_ready) for name, part in measured.items() if part.ready is not None}
         pictures["ready"] = draw_scenes(ready, directory / "ready.png")
     figures = {name: part.figures for name, part in measured.items()}
-    scene_type = measured["base"].raw.scene_type.name
     write_report(
         directory / "report.html",
         "demo.html",
-        title=f"{scene_type.replace('_', ' ').capitalize()}, steered two ways",
+        title=f"{measured['base'].raw.scene_type.name.replace('_', ' ').capitalize()}, steered two ways",
         runs=runs,
         figures_of=figures,
         count=int(figures["base"]["scenes"]),
