@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+from agents.configuration.composition import config_text
 from agents.post_training.report import (
     PHYSICS_TIMEOUT,
     SAMPLE_SEED,
@@ -111,18 +112,17 @@ def _write_page(directory: Path, runs: Mapping[str, _Finished], measured: Mappin
         ready = {name: (part.ready, part.is_ready) for name, part in measured.items() if part.ready is not None}
         pictures["ready"] = draw_scenes(ready, directory / "ready.png")
     figures = {name: part.figures for name, part in measured.items()}
-    scene_type = measured["base"].raw.scene_type.name
     write_report(
         directory / "report.html",
         "demo.html",
-        title=f"{scene_type.replace('_', ' ').capitalize()}, steered two ways",
+        title=f"{measured['base'].raw.scene_type.name.replace('_', ' ').capitalize()}, steered two ways",
         runs=runs,
         figures_of=figures,
         count=int(figures["base"]["scenes"]),
         left_out=left_out,
         pictures=pictures,
         rows=number_rows(figures),
-        settings={f"{name}: {key}": value for name, run in runs.items() for key, value in run.config.items()},
+        settings=config_text({name: run.config for name, run in runs.items()}),
     )
 
 

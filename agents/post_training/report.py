@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
+from agents.configuration.composition import config_text
 from agents.evaluation.physics_figures import leaving_out, per_scene_and_fraction
 from agents.post_training.guard import realism
 from agents.post_training.rollouts import PromptDeck, run_prompts, stream_seed
@@ -136,7 +137,7 @@ def post_train_and_compare(
         left_out=left_out,
         pictures=_draw_pictures(directory, before, after),
         rows=rows_with_change(before.figures, after.figures),
-        settings=settings,
+        settings=config_text(settings),
     )
     write_json(directory / METRICS_NAME, metrics)
     return metrics

@@ -145,7 +145,7 @@ def test_the_report_shows_figures_beside_the_base_prior(tmp_path: Path) -> None:
         metrics = {"iterations": 2, "guard": guard, "hold": None, "reward": {"invalid_scenes": 0}}
         return write_report(
             tmp_path / "r.html", "run.html", title="t", reward="count", algorithm="NFT", metrics=metrics,
-            before=figures, after=figures, left_out={"feasible": "no"}, rows=[("", "before")], settings={},
+            before=figures, after=figures, left_out={"feasible": "no"}, rows=[("", "before")], settings="",
             pictures=dict.fromkeys(("curve", "before", "after"), picture),
         ).read_text()  # fmt: skip
 

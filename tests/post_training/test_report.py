@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 from pathlib import Path
@@ -26,6 +27,7 @@ from agents.priors.testing import tiny_prior
 from rewards import make_reward
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.errors import TrainingError
+from scene_envs.files import read_sealed
 from scene_envs.scene import SceneBatch
 from tests.helpers.simulators import no_simulator
 from tests.helpers.small_runs import count_objects, small_config
@@ -77,7 +79,7 @@ def test_page_needs_nothing_but_itself_and_escapes_text(tmp_path: Path) -> None:
     text = write_report(
         tmp_path / "r.html", "demo.html", title="<t>", runs={"<b>": run}, figures_of=figures, count=2,
         left_out={"feasible": "no"}, pictures={"samples": picture}, rows=[("x", "y"), ("1", "<2>")],
-        settings={"k": "<v>"},
+        settings="k: <v>",
     ).read_text()  # fmt: skip
     assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)""", text)
     assert "http" not in text
@@ -108,6 +110,8 @@ def test_report_and_metrics_have_the_trained_reward_before_and_after(tmp_path: P
     assert "reward: squared count" in page
     assert "the trained reward" in page
     assert f"{metrics['after']['reward']:.2f}" in page
+    shown = html.unescape(page.partition('<pre class="scroll">')[2].partition("</pre>")[0])
+    assert shown == read_sealed(tmp_path / "config.yaml")  # the settings as --config reads them
 
 
 @pytest.mark.slow
