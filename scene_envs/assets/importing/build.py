@@ -73,7 +73,7 @@ def _one_of(words: Any) -> Limit:
     return Limit(lambda value: value in get_args(words), f"must be one of {', '.join(get_args(words))}")
 
 
-_Text = Annotated[str, Limit(lambda value: isinstance(value, str), "must be text; put it in quotes")]
+_Text = Annotated[str, Limit(lambda value: isinstance(value, str) and value != "", "must be text; put it in quotes")]
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,7 @@ class AssetEntry(Checked):
     welded: bool | None = None  # to the world; the file decides by default
     up: Annotated[Axis, _one_of(Axis)] = "z"  # axis of the file that points up
     color: Color | None = None  # class colour (r, g, b), also for surfaces without one
-    base: Annotated[Base, _one_of(Base)] = (
-        "bottom"  # "bottom": frame under the middle of the bounding box; "origin": as in the file
-    )
+    base: Annotated[Base, _one_of(Base)] = "bottom"  # frame under the middle of the bounding box, or as in the file
     decomposition: Annotated[Method, _one_of(Method)] = "auto"  # see convex_parts
     concavity: Positive = 0.05  # CoACD's threshold, 0.01 (many parts) to 1 (one)
 
@@ -158,7 +156,7 @@ def _entry(item: Any, where: str, folder: Path) -> AssetEntry:
     if not path.is_file():
         raise InvalidInputError(f"{where}: there is no such file in {folder}")
     texts = {key: value.strip() if isinstance(value, str) else value for key, value in item.items()}
-    values = {key: value for key, value in texts.items() if value is not None and value != ""}
+    values = {key: value for key, value in texts.items() if value is not None}
     if "mass" in values and "density" in values:
         raise InvalidInputError(f"{where}: give mass or density, not both")
     if values.get("welded") and ("mass" in values or "density" in values):
