@@ -89,7 +89,7 @@ def draw(folder: Path, path: Path) -> None:
                       linewidth=1.2, marker="" if key == "reward" else ".")  # fmt: skip
         axes.set(xlabel="iteration", title=label)
         axes.grid(alpha=0.3)
-    upper.axes[1].legend(fontsize=8, loc="upper left")
+    upper.legend(*upper.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(RUNS), fontsize=9)
     cells = lower.subplots(2, 2 * len(MOMENTS))
     for column, moment in enumerate(MOMENTS):
         batch = SceneBatch.load(folder / f"moment_{moment}.safetensors")
