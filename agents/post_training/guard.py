@@ -20,7 +20,7 @@ _AT_ONCE = 32
 """Number of scenes sampled together."""
 _CLASSIFIERS = 3
 """Number of classifiers over which the accuracy is averaged."""
-_STATE = ("base_loss", "base_samples", "best_reward", "best_score", "best_iteration")
+_STATE = ("base_loss", "base_samples", "best_reward", "best_error", "best_score", "best_iteration")
 """Attributes of a guard that are kept in a checkpoint, beside its readings."""
 
 
@@ -40,7 +40,8 @@ class Guard:
         seed: seed of the fixed timesteps and noise.
         prompts: gives one prompt of each held-out scene; the loss is measured without prompts where it gives None.
         samples: settings for sampling and measuring; None measures the loss alone.
-        limits: largest excess of each figure of samples over that of the base prior, by name.
+        limits: largest excess of each figure of samples over that of the base prior, by name; that of ``reward`` is
+            the largest fall of the mean reward below the best checkpoint's, in standard errors of their difference.
         target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
         learns: whether the reward learns during the run.
 
@@ -71,6 +72,7 @@ class Guard:
         self.last_samples: SceneBatch | None = None
         self.readings: list[GuardReading] = []
         self.best_reward = self.best_score = float("-inf")
+        self.best_error = float("nan")  # standard error of ``best_reward`` over samples
         self.best_iteration = 0
 
     def start(self, base: ScenePrior) -> None:
@@ -79,6 +81,7 @@ class Guard:
         if self.base_samples:
             reward = self.base_samples["sample_reward"]
             self.best_reward = float("-inf") if math.isnan(reward) else reward  # so that every reward is larger
+            self.best_error = self.base_samples["sample_reward_error"]
             self.best_score = self._score(self.best_reward, self.base_samples)
 
     def _score(self, reward: float, figures: Mapping[str, float]) -> float:
@@ -120,6 +123,7 @@ class Guard:
         if figures:
             reward = figures["sample_reward"]
             over += beyond(figures, self.base_samples, self.limits)
+            over += ["reward"] if self._fell(figures) else []
         counts = self.samples is None or sample
         score = self._score(reward, figures)
         kept = counts and not over and ratio <= self.target and score > self.best_score  # False for NaN
@@ -127,7 +131,16 @@ class Guard:
         self.readings.append(reading)
         if kept:
             self.best_reward, self.best_score, self.best_iteration = reward, score, iteration
+            self.best_error = figures.get("sample_reward_error", float("nan"))
         return reading
+
+    def _fell(self, figures: Mapping[str, float]) -> bool:
+        """Whether the mean reward of samples is below the best checkpoint's by more than its limit, in standard errors
+        of their difference; False for NaN, and for a reward that learns, whose values cannot be compared.
+        """
+        error = math.hypot(self.best_error, figures["sample_reward_error"])
+        fall = self.best_reward - figures["sample_reward"]
+        return not self.learns and fall > self.limits.get("reward", math.inf) * error
 
     @property
     def ratio(self) -> float:
@@ -179,7 +192,7 @@ class SampleCheck:
     >>> prior = tiny_prior()
     >>> check = SampleCheck(prior.sample(20, num_steps=2, seed=1), scorer, 20, num_steps=2, seed=0)
     >>> sorted(check.figures(check.sample(prior)))
-    ['category_kl', 'classifier_accuracy', 'count_distance', 'sample_reward', 'stack_distance']
+    ['category_kl', 'classifier_accuracy', 'count_distance', 'sample_reward', 'sample_reward_error', 'stack_distance']
     """
 
     real: SceneBatch  # scenes that are not used in training
@@ -217,19 +230,21 @@ class SampleCheck:
         return batch.tensor.cpu()
 
     def figures(self, batch: SceneBatch) -> dict[str, float]:
-        """Mean reward, and differences from the real scenes: distances of object counts and of tallest stacks
-        (objects), KL divergence of categories (nats), and accuracy of a classifier (share of scenes). A figure that has
-        no meaning, such as the categories of empty scenes, is NaN. Assets without geometry have no stacks.
+        """Mean reward and its standard error, and differences from the real scenes: distances of object counts and of
+        tallest stacks (objects), KL divergence of categories (nats), and accuracy of a classifier (share of scenes). A
+        figure that has no meaning, such as the categories of empty scenes, is NaN. Assets without geometry have no
+        stacks.
         """
         from agents.evaluation.classifier import classifier_accuracy
         from agents.evaluation.layouts import category_kl, count_wasserstein, stack_wasserstein
 
         batch = batch.to("cpu")
         score = self.scorer(batch, self.prompts)
-        valid = score.valid.cpu()
+        rewards = score.value.cpu()[score.valid.cpu()]
         empty = not int(batch.counts.sum())
         return {
-            "sample_reward": float(score.value.cpu()[valid].mean()) if bool(valid.any()) else float("nan"),
+            "sample_reward": float(rewards.mean()) if len(rewards) else float("nan"),
+            "sample_reward_error": float(rewards.std() / len(rewards) ** 0.5) if len(rewards) > 1 else float("nan"),
             "count_distance": count_wasserstein(batch, self.real),
             **({"stack_distance": stack_wasserstein(batch, self.real)} if batch.scene_type.has_geometry else {}),
             "category_kl": float("nan") if empty else category_kl(batch, self.real),

@@ -58,7 +58,7 @@ class AlgorithmSettings(Checked):
     """Learning rate unless ``optimizer.lr`` names another."""
     regularisation_weight: ClassVar[float] = 0.5
     """Coefficient of the pretraining loss unless ``regularisation.weight`` names another."""
-    sample_limits: ClassVar[Mapping[str, float]] = {}
+    sample_limits: ClassVar[Mapping[str, float]] = {"reward": 5.0}
     """Limits of the guard's figures of samples unless ``guard.limits`` names others."""
 
     name: str = ""
@@ -124,6 +124,7 @@ class ForwardProcessSettings(AlgorithmSettings):
     learning_rate: ClassVar[float] = 2e-4
     regularisation_weight: ClassVar[float] = 0.2
     sample_limits: ClassVar[Mapping[str, float]] = {
+        **AlgorithmSettings.sample_limits,
         "count_distance": 1.0,
         "stack_distance": 0.5,
         "category_kl": 0.05,
@@ -311,6 +312,8 @@ class GuardLimits(Checked):
         stack: the same for the distance between the heights of the tallest stacks, in objects.
         category: the same for the KL divergence of the categories, in nats.
         classifier: the same for the accuracy of a classifier that tells samples from real scenes.
+        reward: number of standard errors by which the mean reward of samples may lie below the best checkpoint's; no
+            limit with a reward that learns.
     """
 
     place = "guard.limits."
@@ -318,6 +321,7 @@ class GuardLimits(Checked):
     stack: Nonnegative | None = None
     category: Nonnegative | None = None
     classifier: Nonnegative | None = None
+    reward: Nonnegative | None = None
 
 
 @dataclass
@@ -358,6 +362,7 @@ class GuardSettings(Checked):
             "stack_distance": self.limits.stack,
             "category_kl": self.limits.category,
             "classifier_accuracy": self.limits.classifier,
+            "reward": self.limits.reward,
         }
         return {**defaults, **{name: limit for name, limit in own.items() if limit is not None}}
 

@@ -22,6 +22,7 @@ from agents.post_training.settings import GuardSettings
 from agents.post_training.trainer import PostTrainer
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
+from rewards.base import RewardContext, RewardOutput
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
@@ -169,7 +170,7 @@ def test_the_guard_samples_no_more_than_it_compares_with() -> None:
 def test_a_reward_that_learns_is_judged_by_the_classifier(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reward's own mean falls while the samples become harder to tell from real scenes: the last one is kept."""
     figures = [
-        {"sample_reward": reward, "count_distance": 0.0, "category_kl": 0.0, "classifier_accuracy": accuracy}
+        {"sample_reward": reward, "sample_reward_error": 0.01, "count_distance": 0.0, "classifier_accuracy": accuracy}
         for reward, accuracy in ((0.4, 0.9), (0.5, 0.92), (0.3, 0.8))
     ]
     kept = {}
@@ -180,6 +181,38 @@ def test_a_reward_that_learns_is_judged_by_the_classifier(monkeypatch: pytest.Mo
         guard.start(tiny_prior())
         kept[learns] = [guard.check(tiny_prior(), iteration, reward=0.0).kept for iteration in (1, 2)]
     assert kept == {True: [False, True], False: [True, False]}
+
+
+def test_a_mean_reward_below_the_best_checkpoints_is_beyond_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Means of 0.9 and 0.8 with standard errors of 0.03 and 0.04 differ by two standard errors of their difference."""
+
+    def beyond_limits(limit: float, learns: bool = False, error: float = 0.04) -> list[tuple[str, ...]]:
+        guard = Guard(tiny_prior().initial(2, 34), limit=1.1, seed=0, limits={"reward": limit}, learns=learns)
+        means = iter([(0.7, 0.03), (0.9, 0.03), (0.8, error)])
+        figures = ({"sample_reward": m, "sample_reward_error": e, "classifier_accuracy": 1 - m} for m, e in means)
+        monkeypatch.setattr(guard, "_measure", lambda prior, sample: (1.0, next(figures)))
+        guard.start(tiny_prior())
+        return [guard.check(tiny_prior(), iteration, reward=0.0).beyond for iteration in (1, 2)]
+
+    assert beyond_limits(1.99) == [(), ("reward",)]
+    assert beyond_limits(2.01) == [(), ()]
+    assert beyond_limits(1.99, learns=True) == [(), ()]
+    assert beyond_limits(1.99, error=float("nan")) == [(), ()]
+
+
+def test_a_run_whose_reward_falls_returns_to_its_best_checkpoint(tmp_path: Path) -> None:
+    checks = 0
+
+    def falling(batch: SceneBatch, context: RewardContext) -> RewardOutput:
+        """From 0 to 1 over the samples of the base prior, and ten less at each check from the second on."""
+        nonlocal checks
+        checks += len(batch) == 20
+        return RewardOutput(torch.linspace(0.0, 1.0, len(batch)) - (10.0 if checks > 2 else 0.0))
+
+    keys = {"reward": falling, "iterations": 3, "guard.every": 1, "guard.samples_every": 1, "guard.action": "rollback"}
+    guard = post_train(small_config(tmp_path, **SAMPLES | keys), prior=tiny_prior()).metrics["guard"]
+    assert [check["beyond"] for check in guard["checks"]] == [(), ("reward",), ("reward",)]
+    assert (guard["rollbacks"], guard["best_iteration"], guard["over_optimised_from"]) == (2, 0, 2)
 
 
 def test_a_check_compares_stacks_with_those_of_real_scenes(tmp_path: Path) -> None:
