@@ -1,4 +1,4 @@
-"""The command render: what its files hold agrees with what `observe` gives, and wrong settings are named."""
+"""The commands render and view: what files hold agrees with what `observe` gives, and wrong settings are named."""
 
 from __future__ import annotations
 
@@ -110,3 +110,10 @@ def test_impossible_cameras_are_named(
     words = [f"scenes={scenes}", "count=1", "modes=[depth]", f"cameras={tmp_path / 'cameras.json'}"]
     assert main(["render", *words, f"output={tmp_path / 'out'}"]) == 2
     assert message.replace(".0.0, 0.0, -0.02.", "[0.0, 0.0, -0.02]") in capsys.readouterr().err
+
+
+def test_view_refuses_a_scene_type_that_its_scenes_are_not_of(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["view", f"scenes={scenes}", "scene=pantry_shelf", f"output={tmp_path / 'out'}"]) == 2
+    assert "are of type 'dimsum_table', not scene=pantry_shelf; leave scene= out" in capsys.readouterr().err

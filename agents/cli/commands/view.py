@@ -99,6 +99,11 @@ def _read(settings: ViewConfig) -> tuple[SceneBatch, list[str] | None, str, bool
     if not is_dataset(path):
         everything, captions = load_scenes(path), None
         total, batch = len(everything), everything[chosen]
+        if settings.scene not in ("", batch.scene_type.name):
+            raise InvalidInputError(
+                f"view: the scenes of {str(path)!r} are of type {batch.scene_type.name!r}, not scene={settings.scene}; "
+                "leave scene= out"
+            )
     else:
         dataset = SceneDataset.load(path, scene_type=settings.scene or None, limit=chosen.stop + 1)
         total, captions = len(dataset), dataset.prompts[chosen]
