@@ -53,6 +53,8 @@ denoised translations, m, on their device. If the shift is None, the step is not
 
 _FINE = 0.03
 """Error (m) of horizontal positions below which objects are moved; above it, overlaps are not known yet."""
+_LAST_ROUNDS = 2
+"""Further rounds at the last step, in which a metre costs the same along every axis."""
 
 
 class PhysicsGuidance:
@@ -61,7 +63,7 @@ class PhysicsGuidance:
     From the step on at which the horizontal error of the denoised positions is below 3 cm, objects that overlap in the
     denoised scene come apart, and floating ones come down, by ``strength`` times the moves of
     :func:`~scene_envs.physics.correction.corrections`. The following steps adapt the scene to the moves. At the last
-    step the moves change the sample itself.
+    step the moves change the sample itself, and further rounds take apart what one round has left.
 
     Args:
         strength: factor on the moves, 0 to 1.
@@ -81,11 +83,16 @@ class PhysicsGuidance:
         """(B, N, 3) m, how far the denoised positions move.
 
         Args:
-            step, steps: not used.
+            step, steps: number of the step, from 0, and of all steps.
             denoised: function that gives the B scenes that the network expects.
             std: (3,) standard deviation of their positions along the axes of the world, m.
         """
-        return self.strength * corrections(denoised(), std, self._movable)
+        scenes = denoised()
+        moves = corrections(scenes, std, self._movable)
+        for _ in range(_LAST_ROUNDS if step == steps - 1 else 0):
+            moved = scenes.with_poses(scenes.translations + moves, scenes.rotations)
+            moves = moves + corrections(moved, torch.ones_like(std), self._movable)
+        return self.strength * moves
 
     @staticmethod
     def acts(std: Tensor) -> bool:

@@ -20,7 +20,7 @@ from agents.priors.testing import tiny_prior
 from scene_envs.datasets import describe, parse_prompt, scene_facts
 from scene_envs.errors import InvalidInputError
 from scene_envs.grammars import get_grammar
-from scene_envs.physics import feasibility
+from scene_envs.physics import feasibility, penetration
 from scene_envs.physics.correction import corrections
 from scene_envs.scene import SceneBatch
 from tests.helpers.simple_scenes import SIDE
@@ -204,6 +204,21 @@ def test_moves_are_the_corrections_times_the_strength(overlapping: SceneBatch) -
         assert shift is not None
         torch.testing.assert_close(shift, strength * moves)
     assert moves.abs().max() > 0.004
+
+
+def test_further_rounds_at_the_last_step_take_apart_what_one_round_leaves() -> None:
+    """Scenes of the grammar whose objects were moved by a centimetre: no step follows that could adapt them."""
+    scenes = get_grammar("breakfast_table_low_clutter").sample(np.random.default_rng(0), 32)
+    noise = 0.01 * torch.randn(scenes.translations.shape, generator=torch.Generator().manual_seed(0))
+    rough = scenes.with_poses(scenes.translations + noise * scenes.is_free[..., None], scenes.rotations)
+
+    def colliding(step: int) -> int:
+        moves = PhysicsGuidance(1.0)(step, 50, lambda: rough, STD)
+        pairs = penetration(rough.with_poses(rough.translations + moves, rough.rotations)).pairs
+        return sum(any(pair.depth > 1e-3 for pair in scene) for scene in pairs)
+
+    assert colliding(48) >= 2
+    assert colliding(49) == 0
 
 
 def test_nothing_moves_while_positions_are_uncertain(overlapping: SceneBatch) -> None:
