@@ -14,6 +14,7 @@ import csv
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from agents import ScenePrior
@@ -45,8 +46,10 @@ SHARED = {
     "guard.samples_every": 50,
     "logger.report_scenes": 0,
 }
-CURVES = {"reward": "feasible share of a batch", "guard_ratio": "held-out loss / base prior's",
+CURVES = {"reward": "feasible share, mean of five batches", "guard_ratio": "held-out loss / base prior's",
           "guard_classifier_accuracy": "accuracy of the guard's classifier"}  # fmt: skip
+_BATCHES = 5
+"""Batches over which the curve of the reward is averaged."""
 COLORS = {"published": "#c44e52", "rollback": "#dd8452", "defaults": "#4c72b0"}
 
 
@@ -85,8 +88,12 @@ def draw(folder: Path, path: Path) -> None:
     for axes, (key, label) in zip(upper.subplots(1, len(CURVES)), CURVES.items(), strict=True):
         for name, (title, _) in RUNS.items():
             rows = [row for row in read(folder, name) if key in row]
-            axes.plot([row["iteration"] for row in rows], [row[key] for row in rows], color=COLORS[name], label=title,
-                      linewidth=1.2, marker="" if key == "reward" else ".")  # fmt: skip
+            iterations, values = np.array([(row["iteration"], row[key]) for row in rows]).T
+            if key == "reward":
+                values = np.convolve(values, np.full(_BATCHES, 1 / _BATCHES), mode="valid")
+                iterations = iterations[_BATCHES - 1 :]
+            axes.plot(iterations, values, color=COLORS[name], label=title, linewidth=1.2,
+                      marker="" if key == "reward" else ".", markersize=4)  # fmt: skip
         axes.set(xlabel="iteration", title=label)
         axes.grid(alpha=0.3)
     upper.legend(*upper.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(RUNS), fontsize=9)
