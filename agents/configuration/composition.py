@@ -58,7 +58,7 @@ def check_types(kind: type, values: Mapping[str, Any]) -> None:
     Traceback (most recent call last):
     scene_envs.errors.InvalidInputError: depth=deep is not a whole number
     """
-    for name, wanted in get_type_hints(kind).items():
+    for name, wanted in _hints(kind)[0].items():
         plain = set(get_args(wanted) if get_origin(wanted) in (Union, types.UnionType) else (wanted,))
         if name not in values or not plain <= {int, float, str, bool, NoneType}:
             continue
@@ -272,8 +272,15 @@ def _refusal(hint: Any, value: Any, path: str) -> InvalidInputError:
 
 def hint_of(kind: Any, name: str) -> Any:
     """The type of a field, Any where only a component knows it."""
-    hint = get_type_hints(kind, include_extras=True).get(name, Any)
-    return hint.__metadata__[0] if hint == Texts else get_type_hints(kind).get(name, Any)
+    plain, full = _hints(kind)
+    hint = full.get(name, Any)
+    return hint.__metadata__[0] if hint == Texts else plain.get(name, Any)
+
+
+@functools.cache
+def _hints(kind: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Types of the fields of a dataclass, without and with what annotates them; once per class: it takes milliseconds."""
+    return get_type_hints(kind), get_type_hints(kind, include_extras=True)
 
 
 def _wanted(hint: Any) -> str:
