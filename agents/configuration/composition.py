@@ -279,7 +279,7 @@ def hint_of(kind: Any, name: str) -> Any:
 
 @functools.cache
 def _hints(kind: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Types of the fields of a dataclass, without and with what annotates them; once per class: it takes milliseconds."""
+    """Types of the fields of a dataclass, without and with their annotations; once per class: it takes milliseconds."""
     return get_type_hints(kind), get_type_hints(kind, include_extras=True)
 
 

@@ -169,6 +169,7 @@ def test_masks_of_empty_slots_are_those_of_the_run_also_where_an_older_prior_is_
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_grammar_scenes")
 def test_a_prior_trained_further_reads_its_prompts_of_the_grammar() -> None:
     prior, scenes, _ = prepare(PretrainConfig(prior="dimsum_table", data="grammar"))
     assert prior.conditional
