@@ -83,16 +83,17 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
     from omegaconf import OmegaConf, errors
 
     OmegaConf.register_new_resolver("text", lambda code: bytes.fromhex(code[1:]).decode(), replace=True)
-    schema, values = OmegaConf.structured(kind), dict(tree)
+    values, parts = dict(tree), {}
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]
         value = values.get(field.name)
         if field.metadata.get("kinds") and isinstance(value, Mapping):
-            schema[field.name] = OmegaConf.structured(_kind_of(field, value))
+            parts[field.name] = _kind_of(field, value)
         elif field.metadata.get("named") and field.name in values:
             if isinstance(value, int | float):
                 typed = as_command_line_text(value)[:60]
                 raise InvalidInputError(f"{path}{field.name}={typed} is neither a name nor a mapping with a name")
             values[field.name] = _shortest(value)
+    schema = _schema(kind, tuple(parts.items()))  # type: ignore[arg-type]
     try:
         _check_kinds(schema, values, path)
         made: Any = OmegaConf.to_object(OmegaConf.merge(schema, values))
@@ -111,6 +112,17 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
         value = functools.reduce(lambda inner, key: inner[key], place.split("."), values)
         raise _refusal(hint, value, path + place) from error
     return made
+
+
+@functools.cache
+def _schema(kind: type, parts: tuple[tuple[str, type], ...]) -> Any:
+    """The structured config of ``kind`` with other dataclasses for some groups; to be read only, as it is made once."""
+    from omegaconf import OmegaConf
+
+    schema = OmegaConf.structured(kind)
+    for name, part in parts:
+        schema[name] = OmegaConf.structured(part)
+    return schema
 
 
 def _check_kinds(schema: Any, values: Mapping[str, Any], path: str) -> None:
