@@ -452,7 +452,7 @@ def read_numbers(prior: MixedPrior, prompt: str) -> torch.Tensor:
 @pytest.mark.slow
 def test_numbers_of_objects_are_read_from_prompts() -> None:
     prior, data = fresh(count=96)
-    assert warm_up_text(prior, data, 250, 16, seed=0) is not None
+    assert warm_up_text(prior, data, 250, 8, seed=0) is not None
     assert [int(read_numbers(prior, f"A scene with {n} objects.")[-1]) for n in (4, 6, 8)] == [4, 6, 8]
     kinds = list(dict.fromkeys(asset.display_name for asset in prior.scene_type.library))
     games = [
