@@ -2,7 +2,7 @@
 
 All matrices map body-frame vectors to the frame they are expressed in. Angles are in radians, quaternions are (w, x, y,
 z). All functions run in batches on the device of their argument and can be differentiated. ``roma`` is imported where
-it is called: it loads torch's compiler, which takes as long as torch itself, and workers of physics need neither.
+it is called: it loads torch's compiler, which takes as long as torch itself and which processes of rewards never use.
 """
 
 from __future__ import annotations
