@@ -1,12 +1,12 @@
 """Rotation representations: the conversions of ``roma`` in this project's conventions.
 
 All matrices map body-frame vectors to the frame they are expressed in. Angles are in radians, quaternions are (w, x, y,
-z). All functions run in batches on the device of their argument and can be differentiated.
+z). All functions run in batches on the device of their argument and can be differentiated. ``roma`` is imported where
+it is called: it loads torch's compiler, which takes as long as torch itself and which processes of rewards never use.
 """
 
 from __future__ import annotations
 
-import roma
 import torch
 from torch import Tensor
 
@@ -19,6 +19,8 @@ def project_to_so3(matrices: Tensor) -> Tensor:
             [0., 1., 0.],
             [0., 0., 1.]])
     """
+    import roma
+
     nearest: Tensor = roma.special_procrustes(matrices.double(), method="svd")
     return nearest.to(matrices.dtype)
 
@@ -33,12 +35,16 @@ def yaw_matrix(yaw: Tensor) -> Tensor:
 
 def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
     """Angle in [0, pi] between rotations ``a`` and ``b``, both (..., 3, 3); accurate for tiny angles."""
+    import roma
+
     angle: Tensor = roma.rotmat_geodesic_distance(a.double(), b.double())
     return angle.to(a.dtype)
 
 
 def matrix_to_quaternion(matrices: Tensor) -> Tensor:
     """Unit quaternions (w, x, y, z) with w >= 0 of rotation matrices (..., 3, 3)."""
+    import roma
+
     quaternion = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(matrices.double()))
     return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion).to(matrices.dtype)
 

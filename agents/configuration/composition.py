@@ -58,7 +58,7 @@ def check_types(kind: type, values: Mapping[str, Any]) -> None:
     Traceback (most recent call last):
     scene_envs.errors.InvalidInputError: depth=deep is not a whole number
     """
-    for name, wanted in get_type_hints(kind).items():
+    for name, wanted in _hints(kind)[0].items():
         plain = set(get_args(wanted) if get_origin(wanted) in (Union, types.UnionType) else (wanted,))
         if name not in values or not plain <= {int, float, str, bool, NoneType}:
             continue
@@ -83,16 +83,17 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
     from omegaconf import OmegaConf, errors
 
     OmegaConf.register_new_resolver("text", lambda code: bytes.fromhex(code[1:]).decode(), replace=True)
-    schema, values = OmegaConf.structured(kind), dict(tree)
+    values, parts = dict(tree), {}
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]
         value = values.get(field.name)
         if field.metadata.get("kinds") and isinstance(value, Mapping):
-            schema[field.name] = OmegaConf.structured(_kind_of(field, value))
+            parts[field.name] = _kind_of(field, value)
         elif field.metadata.get("named") and field.name in values:
             if isinstance(value, int | float):
                 typed = as_command_line_text(value)[:60]
                 raise InvalidInputError(f"{path}{field.name}={typed} is neither a name nor a mapping with a name")
             values[field.name] = _shortest(value)
+    schema = _schema(kind, tuple(parts.items()))  # type: ignore[arg-type]
     try:
         _check_kinds(schema, values, path)
         made: Any = OmegaConf.to_object(OmegaConf.merge(schema, values))
@@ -111,6 +112,17 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
         value = functools.reduce(lambda inner, key: inner[key], place.split("."), values)
         raise _refusal(hint, value, path + place) from error
     return made
+
+
+@functools.cache
+def _schema(kind: type, parts: tuple[tuple[str, type], ...]) -> Any:
+    """The structured config of ``kind`` with other dataclasses for some groups; to be read only, as it is made once."""
+    from omegaconf import OmegaConf
+
+    schema = OmegaConf.structured(kind)
+    for name, part in parts:
+        schema[name] = OmegaConf.structured(part)
+    return schema
 
 
 def _check_kinds(schema: Any, values: Mapping[str, Any], path: str) -> None:
@@ -272,8 +284,15 @@ def _refusal(hint: Any, value: Any, path: str) -> InvalidInputError:
 
 def hint_of(kind: Any, name: str) -> Any:
     """The type of a field, Any where only a component knows it."""
-    hint = get_type_hints(kind, include_extras=True).get(name, Any)
-    return hint.__metadata__[0] if hint == Texts else get_type_hints(kind).get(name, Any)
+    plain, full = _hints(kind)
+    hint = full.get(name, Any)
+    return hint.__metadata__[0] if hint == Texts else plain.get(name, Any)
+
+
+@functools.cache
+def _hints(kind: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Types of the fields of a dataclass, without and with their annotations; once per class: it takes milliseconds."""
+    return get_type_hints(kind), get_type_hints(kind, include_extras=True)
 
 
 def _wanted(hint: Any) -> str:

@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from functools import cached_property
 
-import roma
 import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
@@ -202,6 +201,8 @@ def encode_rotations(matrices: Tensor, rotation: str) -> Tensor:
         return matrices.flatten(-2)
     quaternion = _canonical(matrix_to_quaternion(matrices.double()))
     if rotation == "axis_angle":
+        import roma
+
         return roma.unitquat_to_rotvec(quaternion.roll(-1, dims=-1), shortest_arc=False).to(matrices.dtype)
     return quaternion.to(matrices.dtype)
 
@@ -219,6 +220,8 @@ def decode_rotations(code: Tensor, rotation: str) -> Tensor:
     if rotation == "matrix":
         return project_to_so3(code.unflatten(-1, (3, 3)))
     if rotation == "axis_angle":
+        import roma
+
         return roma.rotvec_to_rotmat(code.double()).to(code.dtype)
     quaternion = code.double()
     none = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64, device=code.device)

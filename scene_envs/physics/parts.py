@@ -46,7 +46,7 @@ class PartGeometry:
         normals = normals[lengths > 1e-14] / lengths[lengths > 1e-14, None]
         kept: list[int] = []
         for index, normal in enumerate(normals):
-            if all(normals[other] @ normal < 1.0 - 1e-9 for other in kept):
+            if not kept or (normals[kept] @ normal).max() < 1.0 - 1e-9:
                 kept.append(index)
         normals = normals[kept] if kept else np.concatenate([np.eye(3), -np.eye(3)])
         return cls(part.vertices, normals, (normals @ part.vertices.T).max(axis=1))

@@ -114,14 +114,13 @@ def test_guidance_by_claims_numbers_and_gradients_stays_on_its_device(monkeypatc
         to_gpu(prior)
         there, free = scenes.to("cuda"), fake(~kept)
         counts = []
-        for steps in (STEPS, 2 * STEPS, STEPS, 2 * STEPS):  # the first two copy constants
+        for steps in (STEPS, 2 * STEPS, 2 * STEPS, STEPS):  # the first two copy constants
             crossings.clear()
-            prior.inpaint(there, free, **how | {"num_steps": steps})
+            batch = prior.inpaint(there, free, **how | {"num_steps": steps})
             del crossings.to_gpu["prior.py:draw_noise"]  # one generator for each scene, on the CPU
             for check in ("_require_scene_tensor", "from_parts"):  # that new scenes are finite, with known categories
                 del crossings.reads[f"scene.py:{check}"]
             counts.append([dict(each) for each in (crossings.to_host, crossings.to_gpu, crossings.reads)])
-        batch = prior.inpaint(there, free, **how)
     assert counts[2] == counts[3]  # whatever the number of steps
     torch.testing.assert_close(plain(batch.tensor), expected.tensor, atol=1e-4, rtol=0)
 

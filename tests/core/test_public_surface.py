@@ -88,7 +88,7 @@ def test_a_room_shows_what_other_modules_define(room: str) -> None:
 HEAVY = ("pybullet", "fcl", "trimesh", "torchrl", "rewards", "agents")
 STEPS = {
     "the package": ("import scene_envs", ("torch", *HEAVY)),
-    "a class": ("from scene_envs import SceneBatch, get_scene_type", HEAVY),
+    "a class": ("from scene_envs import SceneBatch, get_scene_type", ("torch._dynamo", *HEAVY)),
     "an environment": ("import scene_envs.envs.denoising", ("rewards", "agents")),
     "planners": ("from agents.planning import list_planners; found['known'] = list(list_planners())", ()),
     "text encoders": ("import agents.networks.text_encoders", ("transformers",)),

@@ -17,7 +17,6 @@ from rewards import IsolatedReward, allow_local_rewards, evaluate_reward
 from scene_envs import SceneBatch
 from scene_envs.datasets import generate
 from scene_envs.errors import InvalidInputError, PhysicsError
-from scene_envs.physics import PhysicsPool, feasibility
 from scene_envs.workers import Process, Task, WorkerFailure, WorkerPool, run_apart
 
 TARGET = f"{__name__}:Target"
@@ -213,10 +212,9 @@ def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.slow
 @pytest.mark.usefixtures("new_interpreters")
 def test_workers_import_nothing_from_the_current_folder(trap: Path, tmp_path: Path) -> None:
+    """Those of rewards, and those of generation, which simulate and start as all others do."""
     (tmp_path / "mine.py").write_text("def few(batch):\n    return -batch.counts\n")
     allow_local_rewards("mine.py")
-    with PhysicsPool(workers=1) as pool:
-        assert feasibility(SceneBatch.empty("dimsum_table", 2), pool=pool).valid.all()
     with IsolatedReward("./mine.py:few") as reward:
         assert evaluate_reward(reward, SceneBatch.empty("dimsum_table", 2)).is_valid.all()
     generate("dimsum_table", 2, tmp_path / "data", workers=1, shard_size=1, progress=False)

@@ -181,7 +181,7 @@ class TestPrior:
         with pytest.raises(InvalidInputError, match="made from a mixed prior, not 'continuous'"):
             flow.FlowPrior.like(tiny_prior("dimsum_table"))
 
-    @pytest.mark.usefixtures("few_grammar_scenes")
+    @pytest.mark.usefixtures("few_grammar_scenes", "few_residual_levels")
     def test_it_is_pretrained_saved_loaded_and_trained_further(self, flow: ModuleType, tmp_path: Path) -> None:
         words = [
             "data=grammar", "iterations=2", "batch_size=4", "network.hidden=16", "network.heads=2", "network.depth=1",

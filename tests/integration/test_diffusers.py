@@ -26,7 +26,7 @@ from scene_envs.grammars import get_grammar
 
 diffusers = pytest.importorskip("diffusers")
 
-STEPS = (25, 50, 100, 1000)
+STEPS = (25, 50, 1000)
 PREDICTIONS = {"epsilon": "epsilon", "v": "v_prediction", "x0": "sample"}
 PROCESSES = ("continuous", "mixed")
 POSE, STD = 12, 0.5

@@ -335,7 +335,7 @@ def test_features_of_a_position_are_the_mean_of_those_of_noisy_ones(level: float
     made = network(FourierFeaturesConfig(3))
     generator = torch.Generator().manual_seed(1)
     place = torch.rand(1, 1, 3, generator=generator) * 2 - 1
-    noisy = place + level * torch.randn(40_000, 1, 3, generator=generator)
+    noisy = place + level * torch.randn(20_000, 1, 3, generator=generator)
     angle = place[..., None] * math.pi * 2.0 ** torch.arange(3)
     waves = torch.cat([angle.sin().flatten(-2), angle.cos().flatten(-2)], dim=-1)
     torch.testing.assert_close(first_layer_input(made, place, 0.0), waves)

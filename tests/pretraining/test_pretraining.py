@@ -169,6 +169,7 @@ def test_masks_of_empty_slots_are_those_of_the_run_also_where_an_older_prior_is_
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_grammar_scenes")
 def test_a_prior_trained_further_reads_its_prompts_of_the_grammar() -> None:
     prior, scenes, _ = prepare(PretrainConfig(prior="dimsum_table", data="grammar"))
     assert prior.conditional
@@ -451,7 +452,7 @@ def read_numbers(prior: MixedPrior, prompt: str) -> torch.Tensor:
 @pytest.mark.slow
 def test_numbers_of_objects_are_read_from_prompts() -> None:
     prior, data = fresh(count=96)
-    assert warm_up_text(prior, data, 250, 16, seed=0) is not None
+    assert warm_up_text(prior, data, 250, 8, seed=0) is not None
     assert [int(read_numbers(prior, f"A scene with {n} objects.")[-1]) for n in (4, 6, 8)] == [4, 6, 8]
     kinds = list(dict.fromkeys(asset.display_name for asset in prior.scene_type.library))
     games = [

@@ -7,7 +7,7 @@ import io
 import json
 import logging
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -542,10 +542,15 @@ def _missed(sampled: trimesh.Trimesh, obstacles: list[Any], targets: list[Any]) 
     corners = np.array([(0, 0, _APART), (1e-4, 0, far), (-1e-4, 1e-4, far), (-1e-4, -1e-4, far)])
     rod = convex(ConvexPart(corners, np.array([(0, 2, 1), (0, 3, 2), (0, 1, 3), (1, 2, 3)])))
     axes = np.concatenate([np.eye(3), -np.eye(3)])
+
+    @cache  # most of the time goes here, and the points of a flat face have one normal
+    def turned(direction: bytes) -> Any:
+        return align_vectors((0, 0, 1), np.frombuffer(direction))[:3, :3]
+
     gaps = []
-    for point, normal in zip(np.asarray(points), sampled.face_normals[faces], strict=True):
+    for point, normal in zip(np.asarray(points), np.asarray(sampled.face_normals[faces]), strict=True):
         for direction in (normal, *axes):
-            rod.setTransform(fcl.Transform(align_vectors((0, 0, 1), direction)[:3, :3], point))
+            rod.setTransform(fcl.Transform(turned(direction.tobytes()), point))
             if not tree.meets(rod):
                 ball.setTranslation(point)
                 gaps.append(min(gap(target, ball) for target in targets))
