@@ -209,7 +209,7 @@ class Statics:
         points, met = np.concatenate([feet, tops], axis=1), np.concatenate([on_top, on_foot], axis=1)
         for index in np.unique(upper[q]):
             mine = upper[q] == index
-            good[q[mine]] = _surround(points[mine][met[mine]] - center[index])
+            good[q[mine]] = surrounds(points[mine][met[mine]] - center[index])
         return good
 
     def _clear(
@@ -333,11 +333,11 @@ def _outline(points: Array) -> Array | None:
     return outline if outline is not None and area(outline) > 1e-7 else None
 
 
-def _surround(points: Array) -> bool:
+def surrounds(points: Array) -> bool:
     """Whether the convex hull of points (P, 2) m reaches further than ``_BALANCE`` from the origin in all directions.
 
     >>> square = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-    >>> _surround(0.0071 * square), _surround(0.0049 * square), _surround(square[:3])
+    >>> surrounds(0.0071 * square), surrounds(0.0049 * square), surrounds(square[:3])
     (True, False, False)
     """
     points = points[(far := np.hypot(*points.T)) > _BALANCE]
