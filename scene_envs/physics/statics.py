@@ -60,10 +60,10 @@ class _Polygons:
     """Convex polygons in the asset's xy plane, padded with copies of their first corner and edge."""
 
     height: Array  # (P,) z in the asset frame, m; NaN where there is no polygon
+    count: Index  # (P,) number of corners without the copies
     corners: Array  # (P, V, 2) m
     normals: Array  # (P, V, 2) outward
     offsets: Array  # (P, V) m; inside is ``normals @ x <= offsets``
-    count: Index  # (P,) number of corners without the copies
 
     @classmethod
     def of(cls, polygons: list[tuple[float, Array] | None]) -> _Polygons:
@@ -77,7 +77,7 @@ class _Polygons:
             normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
             rows.append((height, points, normal, (normal * points).sum(axis=1)))
         heights, *columns = zip(*rows, strict=True)
-        return cls(np.array(heights), *map(padded, columns), np.array([len(points) for points in columns[0]]))
+        return cls(np.array(heights), np.array(list(map(len, columns[0]))), *map(padded, columns))
 
     def inside(self, rows: Index, points: Array, count: Index) -> Mask:
         """(Q, K) whether each of the first ``count`` (Q,) points (Q, K, 2) is inside polygons ``rows`` (Q,)."""
