@@ -60,6 +60,7 @@ class _Polygons:
     """Convex polygons in the asset's xy plane, padded with copies of their first corner and edge."""
 
     height: Array  # (P,) z in the asset frame, m; NaN where there is no polygon
+    count: Index  # (P,) number of corners without the copies
     corners: Array  # (P, V, 2) m
     normals: Array  # (P, V, 2) outward
     offsets: Array  # (P, V) m; inside is ``normals @ x <= offsets``
@@ -76,7 +77,17 @@ class _Polygons:
             normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
             rows.append((height, points, normal, (normal * points).sum(axis=1)))
         heights, *columns = zip(*rows, strict=True)
-        return cls(np.array(heights), *map(padded, columns))
+        return cls(np.array(heights), np.array(list(map(len, columns[0]))), *map(padded, columns))
+
+    def inside(self, rows: Index, points: Array, count: Index) -> Mask:
+        """(Q, K) whether each of the first ``count`` (Q,) points (Q, K, 2) is inside polygons ``rows`` (Q,)."""
+        low, high = self.corners[rows].min(axis=1) - 1e-9, self.corners[rows].max(axis=1) + 1e-9
+        inside = np.arange(points.shape[1]) < count[:, None]
+        for axis in range(2):  # most points are outside the boxes
+            inside &= (points[..., axis] >= low[:, None, axis]) & (points[..., axis] <= high[:, None, axis])
+        row, column = np.nonzero(inside)
+        inside[row, column] = self.outside(rows[row], points[row, column][:, None])[:, 0] < 0.0
+        return inside
 
     def outside(self, rows: Index, points: Array) -> Array:
         """(Q, K) m, distance of points (Q, K, 2) in the asset frame outside polygons ``rows`` (Q,)."""
@@ -119,8 +130,10 @@ class Statics:
         support[objects.fixed] = -1
         rise, height = _rises(support, drop, objects.fixed)
         center = self._loaded_center(objects, support, height)
-        best = np.zeros(count, dtype=bool)
-        held = (lower == support[upper]) & (contacts.gap[rows] < drop[upper] + _TOUCHING)
+        best, balanced = np.zeros((2, count), dtype=bool)
+        middle = _into(objects, found, center[found][:, None])
+        balanced[found] = self._foot.outside(objects.category[found], middle)[:, 0] < -_BALANCE
+        held = balanced[upper] & (lower == support[upper]) & (contacts.gap[rows] < drop[upper] + _TOUCHING)
         rows, upper, lower = rows[held], upper[held], lower[held]
         good = self._holds(objects, contacts, rows, upper, lower, center)
         best[upper[good]] = True
@@ -162,21 +175,17 @@ class Statics:
     def _holds(
         self, objects: Objects, contacts: Contacts, rows: Index, upper: Index, lower: Index, center: Array
     ) -> Mask:
-        """Whether each contact alone keeps its upper object from tipping."""
-        good = np.zeros(len(rows), dtype=bool)
-        middle = center[upper][:, None]
-        candidates = self._foot.outside(objects.category[upper], _into(objects, upper, middle))[:, 0] < -_BALANCE
-        local = _into(objects, lower, middle)
+        """Whether each contact keeps its upper object, whose centre of mass is above its foot, from tipping."""
+        local = _into(objects, lower, center[upper][:, None])
         parts, is_second = (contacts.part_first[rows], contacts.part_second[rows]), contacts.second[rows] == upper
         part, own = np.where(is_second, *parts), np.where(is_second, *parts[::-1])
-        inside = candidates & (self._surface.outside(part, local)[:, 0] < -_BALANCE)
-        q = np.flatnonzero(inside)
+        good = self._surface.outside(part, local)[:, 0] < -_BALANCE
+        q = np.flatnonzero(good & (self.bottom.hole[objects.category[upper]] != 0))
         up = objects.category[upper[q]]
         corners = _into(objects, lower[q], _out_of(objects, upper[q], self._foot.corners[up]))
-        good[q] = (self.bottom.hole[up] == 0) | (self._surface.outside(part[q], corners).max(axis=1) < 0.0)
+        good[q] = self._surface.outside(part[q], corners).max(axis=1) < 0.0
         # The test of the rim gives the same result for all parts of the two objects.
-        _, leading = np.unique(upper, return_index=True)
-        q = leading[candidates[leading]]
+        _, q = np.unique(upper, return_index=True)
         up, down = objects.category[upper[q]], objects.category[lower[q]]
         at_rim = np.abs(self._rim.height[down] - self._surface.height[part[q]]) < _MEETS
         offset = np.linalg.norm(
@@ -190,18 +199,17 @@ class Statics:
         at_rim &= (hole == 0) | (offset <= self.top.corners[down] - hole)
         good[q] |= at_rim
         # Or several parts carry it, whose contacts are all round the centre of mass.
-        q = np.flatnonzero(candidates & ~np.isin(upper, upper[good]))
-        feet = _out_of(objects, upper[q], self._under.corners[own[q]])
-        tops = _out_of(objects, lower[q], self._surface.corners[part[q]])
-        on_top = self._surface.outside(part[q], _into(objects, lower[q], feet)) < 0.0
-        on_foot = self._under.outside(own[q], _into(objects, upper[q], tops)) < 0.0
-        lowest = np.abs(self._under.height[own[q]] - self._foot.height[objects.category[upper[q]]]) < _FOOT
-        points, met = np.concatenate([feet, tops], axis=1), np.concatenate([on_top, on_foot], axis=1) & lowest[:, None]
+        lowest = np.abs(self._under.height[own] - self._foot.height[objects.category[upper]]) < _FOOT
+        q = np.flatnonzero(lowest & ~np.isin(upper, upper[good]))
+        own, part = own[q], part[q]
+        feet = _out_of(objects, upper[q], self._under.corners[own])
+        tops = _out_of(objects, lower[q], self._surface.corners[part])
+        on_top = self._surface.inside(part, _into(objects, lower[q], feet), self._under.count[own])
+        on_foot = self._under.inside(own, _into(objects, upper[q], tops), self._surface.count[part])
+        points, met = np.concatenate([feet, tops], axis=1), np.concatenate([on_top, on_foot], axis=1)
         for index in np.unique(upper[q]):
             mine = upper[q] == index
-            if (outline := _outline(points[mine][met[mine]])) is not None:
-                hull = _Polygons.of([(0.0, outline)])
-                good[q[mine]] = hull.outside(np.array([0]), center[index][None, None])[0, 0] < -_BALANCE
+            good[q[mine]] = surrounds(points[mine][met[mine]] - center[index])
         return good
 
     def _clear(
@@ -323,6 +331,25 @@ def _outline(points: Array) -> Array | None:
     """Counter-clockwise convex outline (K, 2), or None when there is no area."""
     outline = outline_of(points)
     return outline if outline is not None and area(outline) > 1e-7 else None
+
+
+def surrounds(points: Array) -> bool:
+    """Whether the convex hull of points (P, 2) m reaches further than ``_BALANCE`` from the origin in all directions.
+
+    >>> square = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+    >>> surrounds(0.0071 * square), surrounds(0.0049 * square), surrounds(square[:3])
+    (True, False, False)
+    """
+    points = points[(far := np.hypot(*points.T)) > _BALANCE]
+    if not len(points):
+        return False
+    # a point reaches so far in the directions within an angle of its own: these arcs must cover the circle
+    half = np.arccos(_BALANCE / far[far > _BALANCE])
+    start = (np.arctan2(points[:, 1], points[:, 0]) - half) % (2 * np.pi)
+    order = np.argsort(start)
+    start, end = start[order], (start + 2 * half)[order]
+    covered = np.maximum.accumulate(np.concatenate([[end.max() - 2 * np.pi], end]))
+    return bool((start < covered[:-1]).all())
 
 
 def _surface(vertices: Array, depth: float = 1e-5) -> tuple[float, Array] | None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from scene_envs.grammars import get_grammar
@@ -14,7 +15,7 @@ from scene_envs.physics import FeasibilityResult, equilibrium, feasibility, make
 from scene_envs.physics.bullet import BulletEngine
 from scene_envs.physics.motion import Physics, physics_of
 from scene_envs.physics.placement import ObjectPairs, Objects
-from scene_envs.physics.statics import Rest
+from scene_envs.physics.statics import Rest, surrounds
 from scene_envs.scene import SceneBatch
 from tests.helpers.simple_scenes import SIDE, scene, turned
 
@@ -166,3 +167,13 @@ def test_a_stack_that_only_just_stands_is_not_ready(shift: float, holds: bool) -
     batch = scene(("cube", 0.0, 0.0, 0.0), ("cube", shift, 0.0, SIDE))
     assert feasibility(batch, duration=2.0).feasible[0, 1:3].tolist() == [True, True]
     assert make_ready(batch, rounds=1).ready[0, 1:3].tolist() == [True, holds]
+
+
+def test_points_all_round_are_those_whose_hull_is_5_mm_away() -> None:
+    """SciPy's hull of random points, some twice, has its nearest edge 5 mm or more from the origin inside it."""
+    rng, found = np.random.default_rng(0), []
+    for count in rng.integers(3, 30, 400).tolist():
+        points = rng.choice([0.006, 0.01, 0.03]) * rng.normal(size=(count, 2)) + rng.normal(0.0, 0.01, 2)
+        found.append(surrounds(np.repeat(points, 2, axis=0)))
+        assert found[-1] == bool(ConvexHull(points).equations[:, 2].max() < -5e-3)
+    assert 100 < sum(found) < 300
