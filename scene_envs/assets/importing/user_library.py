@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import logging
 import os
 import re
@@ -176,9 +175,7 @@ def _colored(entries: list[AssetEntry]) -> tuple[AssetEntry, ...]:
     chosen: list[Color] = [entry.color for entry in entries if entry.color is not None]
     taken = [*(recipe.color for recipe in RECIPES.values()), *chosen]
     fresh = iter(distinct_colors(len(entries) - len(chosen), taken))
-    return tuple(
-        entry if entry.color is not None else dataclasses.replace(entry, color=next(fresh)) for entry in entries
-    )
+    return tuple(entry if entry.color is not None else replace(entry, color=next(fresh)) for entry in entries)
 
 
 def build_in_time(request: tuple[Path, AssetEntry]) -> tuple[Asset, AssetReport]:
