@@ -54,7 +54,7 @@ _COARSE_CORNERS = 16
 _DIRECTIONS = np.array(list(np.ndindex(3, 3, 3)), dtype=np.float64) - 1.0
 """Directions to the 26 neighbours of a cell, and the zero vector."""
 Method = Literal["auto", "coacd", "convex"]
-_COACD = {
+COACD_SETTINGS = {
     "max_convex_hull": 32,
     "preprocess_resolution": 30,
     "resolution": 1000,
@@ -245,7 +245,7 @@ def _depth(body: trimesh.Trimesh, hull: ConvexPart) -> float:
 
 def _decompose(body: trimesh.Trimesh, method: Method, threshold: float, what: str) -> list[Array] | None:
     """Corners of the convex pieces of a concave body, from the cache where possible; None without CoACD."""
-    settings = {"threshold": threshold, **_COACD}
+    settings = {"threshold": threshold, **COACD_SETTINGS}
     path = cache_folder() / "decompositions" / f"{_key(body, settings)}.npz"
     pieces = _read(path)
     if pieces is not None:
