@@ -31,7 +31,7 @@ from scene_envs.assets.importing.limits import (
     timed,
     too_slow,
 )
-from scene_envs.assets.importing.mesh_files import Color, find_mesh, read_xml
+from scene_envs.assets.importing.mesh_files import MESH_SUFFIXES, Color, find_mesh, read_xml
 from scene_envs.assets.importing.robot_files import open_stage
 from scene_envs.assets.importing.solids import audit_parts
 from scene_envs.assets.recipes import RECIPES
@@ -39,7 +39,6 @@ from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.workers import WorkerFailure, run_apart
 
 _LOGGER = logging.getLogger(__name__)
-_DESCRIPTIONS = (".urdf", ".sdf", ".xml", ".usd", ".usda", ".usdc")
 
 
 def load_library(folder: str | os.PathLike[str]) -> AssetLibrary:
@@ -137,7 +136,7 @@ def _listed(path: Path, stamp: tuple[int, int]) -> FolderIndex:
 def _unlisted(folder: Path, stamp: tuple[int, int]) -> FolderIndex:
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
     files = [path for path in files if path.suffix.lower() != ".xml" or re.search(rb"<mujoco[\s>]", path.read_bytes())]
-    used = {mesh for path in files if path.suffix.lower() in _DESCRIPTIONS for mesh in _named_files(path)}
+    used = {mesh for path in files if path.suffix.lower() not in MESH_SUFFIXES for mesh in _named_files(path)}
     entries = [default_entry(str(path.relative_to(folder))) for path in files if path.resolve() not in used]
     if not entries:
         raise InvalidInputError(f"{folder} holds no {', '.join(SUFFIXES)} files")
