@@ -296,10 +296,7 @@ class ImportReport:
 
     def __getitem__(self, name: str) -> AssetReport:
         """The report of the asset called ``name``; KeyError without one."""
-        for report in self.assets:
-            if report.name == name:
-                return report
-        raise KeyError(name)
+        return {report.name: report for report in self.assets}[name]
 
     def __str__(self) -> str:
         return "\n".join([f"{self.folder}: {len(self.assets)} assets", *self.notes, *map(str, self.assets)])
