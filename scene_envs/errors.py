@@ -123,6 +123,10 @@ Unlimited = Annotated[float, Limit(lambda value: value > 0, "must be a positive 
 Count = Annotated[int, Limit(lambda value: operator.index(value) >= 1, "must be at least 1")]
 Natural = Annotated[int, Limit(lambda value: operator.index(value) >= 0, "must be at least 0")]
 Seed = Annotated[int, Limit(lambda seed: 0 <= seed < 2**63, "must be from 0 to 2^63 - 1")]
+WORKERS = Limit(
+    lambda workers: workers == "ray" or operator.index(workers) >= 0,
+    "must be a number of processes, 0 for none, or ray for a Ray cluster",
+)
 Share = Annotated[float, Limit(lambda value: 0 <= value <= 1, "is outside 0..1: it is a share")]
 
 

@@ -329,9 +329,9 @@ class SceneBatch:
             return cls(tensors["scenes"], metadata["scene_type"])
         except FileNotFoundError:
             raise InvalidInputError(f"no scene file at {str(path)!r}") from None
+        except UnknownNameError:
+            raise
         except KeyError as error:
-            if isinstance(error, UnknownNameError):
-                raise
             raise CorruptFileError(f"{str(path)!r} is not a scene file written by SceneBatch.save: {error}") from error
 
 

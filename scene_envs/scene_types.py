@@ -251,15 +251,13 @@ def union_scene_type(types: Sequence[str | SceneType], name: str | None = None) 
     if not members:
         raise InvalidInputError("a union needs at least one scene type, got none")
     names = dict.fromkeys(member.name for member in members)
-    lows, highs = ([member.workspace[end] for member in members] for end in (0, 1))
+    lows, highs = (zip(*(member.workspace[end] for member in members), strict=True) for end in (0, 1))
+    workspace: Any = tuple(map(min, lows)), tuple(map(max, highs))
     return SceneType(
         name=name or "+".join(names),
         assets=tuple(sorted({asset for member in members for asset in member.assets})),
         slots=max(member.slots for member in members),
-        workspace=(
-            (min(c[0] for c in lows), min(c[1] for c in lows), min(c[2] for c in lows)),
-            (max(c[0] for c in highs), max(c[1] for c in highs), max(c[2] for c in highs)),
-        ),
+        workspace=workspace,
         welded=tuple(sorted({asset for member in members for asset in member.welded})),
         fixed=tuple(fixed for fixed in members[0].fixed if all(fixed in member.fixed for member in members)),
         camera=max(members, key=lambda member: member.workspace[1][0] - member.workspace[0][0]).camera,

@@ -28,6 +28,7 @@ from agents.utils.loggers import LOGGERS
 from scene_envs.envs.settings import PROMPT_SOURCES, check_guidance
 from scene_envs.errors import (
     BELOW_ONE,
+    WORKERS,
     Checked,
     Count,
     InvalidInputError,
@@ -439,10 +440,7 @@ class PostTrainConfig(GuidanceKeys, SamplingKeys, EngineKeys, TrainingKeys, Prog
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (isinstance(self.workers, int) and self.workers >= 0) and self.workers != "ray":
-            raise InvalidInputError(
-                f"workers={self.workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
-            )
+        WORKERS.check("", "workers", self.workers, False)
         self.prompt = list(self.prompt) if isinstance(self.prompt, tuple) else self.prompt
         check_prompt(self.prompt)
         check_guidance(self.prompt, self.guidance)

@@ -37,6 +37,13 @@ class MassProperties(NamedTuple):
     inertia: Array
 
 
+def pose_of(translation: ArrayLike, rotation: ArrayLike) -> Array:
+    """(4, 4) from a translation (3,) m and a rotation (3, 3)."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, translation
+    return pose
+
+
 def convex_hull(points: ArrayLike) -> ConvexPart:
     """The hull of points (P, 3), triangles facing outward; InvalidInputError for fewer than four points or a plane."""
     cloud = np.asarray(points, dtype=np.float64)

@@ -300,9 +300,6 @@ class Layout:
         fixed object that stands elsewhere, or is missing where no slot is empty.
         """
         values = torch.from_numpy(np.array(rows.scenes))  # a copy: arrow's memory is read-only
-        if not len(values):
-            slots = self.scene_type.slots if self.slots is None else self.slots
-            return torch.empty(0, slots, self.scene_type.features)
         _require_none(~torch.isfinite(values).all(dim=-1), rows, "holds a value that is not finite")
         raw = self.info.normalizer.unnormalize(values)
         one_hot = raw[..., CATEGORY]

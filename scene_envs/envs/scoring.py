@@ -14,7 +14,7 @@ from torch import Tensor
 
 from scene_envs.arrays import resolve_device
 from scene_envs.envs.settings import PROMPT_SOURCES, check_guidance
-from scene_envs.errors import InvalidInputError, MissingDependencyError
+from scene_envs.errors import WORKERS, InvalidInputError, MissingDependencyError
 from scene_envs.protocols import PriorLike, PromptedPriorLike, SceneScorer
 from scene_envs.registry import plugin_entry_points
 from scene_envs.scene import SceneBatch
@@ -115,11 +115,7 @@ class RewardScorer:
     """
 
     def __init__(self, reward: Any, workers: int | str = 0, physics: str = "auto", *, prompted: bool = True) -> None:
-        number = isinstance(workers, int) and workers >= 0
-        if not number and workers != "ray":
-            raise InvalidInputError(
-                f"workers={workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
-            )
+        WORKERS.check("", "workers", workers, False)
         self._score = resolve_reward(reward)
         facts = "depends_on_batch", "averages_objects", "counts_objects", "needs_prompts"
         self.depends_on_batch, self.averages_objects, self.counts_objects, needs_prompts = (

@@ -153,7 +153,8 @@ class SearchProblem:
         """The root of ``seed``: ``scene`` (a batch of one), or a sample of the prior."""
         if scene is None:
             empty = SceneBatch.empty(self.scene_type, 1, self.slots)
-            everything = torch.ones(1, self.slots, dtype=torch.bool) & self._changeable()
+            everything = torch.ones(1, self.slots, dtype=torch.bool)
+            everything[:, : len(self.scene_type.fixed)] = False
             scene = self._inpaint(empty, everything, [node_randomness(seed, ())[0]])
         elif len(scene) != 1 or scene.tensor.shape[1] != self.slots or scene.scene_type.name != self.scene_type.name:
             raise InvalidInputError(
@@ -226,12 +227,6 @@ class SearchProblem:
                 f"{sorted(self.legal_actions(state))}"
             )
 
-    def _changeable(self) -> Tensor:
-        """(N,) bool: slots that may be regenerated, all but those of fixed welded objects."""
-        changeable = torch.ones(self.slots, dtype=torch.bool)
-        changeable[: len(self.scene_type.fixed)] = False
-        return changeable
-
     @property
     def nfe_per_scene(self) -> int:
         """Denoiser evaluations per generated scene."""
@@ -297,7 +292,8 @@ class SearchProblem:
         self, generator: MaskGenerator, scene: SceneBatch, score: Score, seed: int, path: tuple[int, ...]
     ) -> Tensor:
         """(N,) bool: slots that ``generator`` masks at this node, or all if no object is free; welded ones left out."""
-        changeable = self._changeable() & ~scene.is_welded[0]
+        changeable = ~scene.is_welded[0]
+        changeable[: len(self.scene_type.fixed)] = False
         if bool(scene.is_free.any()):
             changeable &= masked_slots(generator, scene, score, node_randomness(seed, path)[1])
         return changeable

@@ -18,7 +18,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import Asset, ConvexPart, Joint, identifiers
-from scene_envs.assets.shapes import convex_hull
+from scene_envs.assets.shapes import convex_hull, pose_of
 from scene_envs.errors import InvalidInputError
 from scene_envs.physics.parts import FRICTION, quaternions
 from scene_envs.render.raster import Pinhole
@@ -102,9 +102,7 @@ class PlacedObject:
     @cached_property
     def matrix(self) -> Array:
         """(4, 4) float64, asset frame to world frame."""
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
-        return matrix
+        return pose_of(self.translation, self.rotation)
 
     @property
     def joints(self) -> tuple[Joint, ...]:
@@ -168,12 +166,6 @@ class PlacedScene:
         """The assets in use, each once, in category order."""
         used = {item.category: item.asset for item in self.objects}
         return tuple(used[category] for category in sorted(used))
-
-    @property
-    def bodies(self) -> tuple[Asset, ...]:
-        """As ``assets``, with the bodies of those whose joints move in their place."""
-        used = {item.category: [piece.asset for piece in item.pieces] for item in self.objects}
-        return tuple(asset for category in sorted(used) for asset in used[category])
 
 
 def place(batch: SceneBatch, friction: float = FRICTION) -> list[PlacedScene]:

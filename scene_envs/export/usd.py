@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from scene_envs.arrays import Array
 from scene_envs.assets.base import RECIPES, Asset
+from scene_envs.assets.shapes import pose_of
 from scene_envs.export.placed import (
     AssetFiles,
     Light,
@@ -135,9 +136,7 @@ def _add_light(stage: Any, light: Light) -> None:
     lamp = UsdLux.DistantLight.Define(stage, "/World/lamp")
     lamp.CreateIntensityAttr(_LAMP * light.intensity)
     lamp.CreateColorAttr(Gf.Vec3f(*linear(light.color).tolist()))
-    pose = np.eye(4)
-    pose[:3, :3] = camera_axes(np.zeros(3), light.direction, up)
-    _place(lamp, pose)
+    _place(lamp, pose_of(np.zeros(3), camera_axes(np.zeros(3), light.direction, up)))
     UsdLux.DomeLight.Define(stage, "/World/sky").CreateIntensityAttr(_SKY)
 
 
@@ -149,9 +148,7 @@ def _add_camera(stage: Any, camera: Camera) -> None:
     view.CreateVerticalApertureAttr(height)
     view.CreateFocalLengthAttr(0.5 * height / float(np.tan(np.radians(camera.fov_y) / 2.0)))
     view.CreateClippingRangeAttr(Gf.Vec2f(0.01, 1000.0))
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = camera_axes(camera.position, camera.target, camera.up), camera.position
-    _place(view, pose)
+    _place(view, pose_of(camera.position, camera_axes(camera.position, camera.target, camera.up)))
 
 
 def _place(prim: Any, pose: Array) -> Any:
@@ -175,8 +172,8 @@ def _add_joints(stage: Any, item: PlacedObject, paths: list[Any]) -> None:
         is_slide = joint.kind == "prismatic"
         kind = UsdPhysics.PrismaticJoint if is_slide else UsdPhysics.RevoluteJoint
         found = kind.Define(stage, folder.AppendChild(joint.name))
-        turn = np.eye(4)  # from the x axis to that of the joint
-        turn[:3, :3] = Rotation.align_vectors(joint.axis, (1.0, 0.0, 0.0))[0].as_matrix()
+        from_x = Rotation.align_vectors(joint.axis, (1.0, 0.0, 0.0))[0].as_matrix()
+        turn = pose_of(np.zeros(3), from_x)  # from the x axis to that of the joint
         made.append((found, [paths[joint.parent], path], joint.pose @ turn, turn))
         degrees = 1.0 if is_slide else np.degrees(1.0)
         found.CreateAxisAttr(UsdPhysics.Tokens.x)
@@ -329,12 +326,11 @@ def _apply_body(prim: Any, asset: Asset) -> None:
 
     UsdPhysics.RigidBodyAPI.Apply(prim)
     moments, axes = principal_inertia(asset.inertia)
-    w, x, y, z = quaternion(axes).tolist()
     mass = UsdPhysics.MassAPI.Apply(prim)
     mass.CreateMassAttr(asset.mass)
     mass.CreateCenterOfMassAttr(Gf.Vec3f(*asset.center_of_mass.tolist()))
     mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*moments.tolist()))
-    mass.CreatePrincipalAxesAttr(Gf.Quatf(w, x, y, z))
+    mass.CreatePrincipalAxesAttr(Gf.Quatf(*quaternion(axes).tolist()))
 
 
 def _metadata(asset: Asset, code: str) -> dict[str, Any]:

@@ -114,10 +114,8 @@ def full_tier() -> Node:
 
 def top_tier() -> Node:
     """The top of the shelf: lamps, a fruit bowl, small games, a speaker."""
-    fruit = OneOf((1.0, Object("apple_gala")), (1.0, Object("pear_bosc")))
-    bowl = Object("fruit_bowl", ANYWHERE, inside=Heap(Repeat(fruit, Geometric(0.5, 0, 3)), 0.03))
     setting = Group(
-        maybe(0.2, bowl),
+        maybe(0.2, fruit_bowl(("apple_gala", "pear_bosc"))),
         maybe(0.3, small_games()),
         maybe(0.1, Object("speaker", ANYWHERE, FACING_FRONT)),
         Repeat(Object("lamp", ANYWHERE), Geometric(0.8, 0, 2)),
@@ -139,15 +137,15 @@ def goods(p: float) -> Node:
     return Group(*(Repeat(Object(kind, ANYWHERE), Geometric(p, 0, 10)) for kind in kinds))
 
 
-def fruit_bowl() -> Node:
-    """A bowl with up to three pieces of fruit."""
-    piece = OneOf(*((1.0, Object(kind)) for kind in FRUIT))
+def fruit_bowl(kinds: Sequence[str]) -> Node:
+    """A bowl with up to three pieces of fruit of these kinds, equally likely."""
+    piece = OneOf(*((1.0, Object(kind)) for kind in kinds))
     return Object("fruit_bowl", ANYWHERE, inside=Heap(Repeat(piece, Geometric(0.5, 0, 3)), 0.03))
 
 
 def pantry(p: float) -> Node:
     """The whole shelf; ``p`` is the parameter of the geometric distribution of the number of each kind."""
-    return Tiers(tiers(goods(p), Group(maybe(0.2, fruit_bowl()), goods(p))))
+    return Tiers(tiers(goods(p), Group(maybe(0.2, fruit_bowl(FRUIT)), goods(p))))
 
 
 @register_grammar("pantry_shelf")

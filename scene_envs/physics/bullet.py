@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -306,10 +307,7 @@ class BulletEngine(Engine):
             (int(category), "fine" if is_fine else "coarse")
             for category, is_fine in zip(objects.category, fine, strict=True)
         ]
-        needed: dict[BodyKey, int] = {}
-        for key in keys:
-            needed[key] = needed.get(key, 0) + 1
-        parked = {key: iter(bodies) for key, bodies in self._pool.take(needed).items()}
+        parked = {key: iter(bodies) for key, bodies in self._pool.take(Counter(keys)).items()}
         bodies = np.empty(len(objects), dtype=np.int64)
         for row in order:
             bodies[row] = next(parked[keys[row]])

@@ -352,7 +352,7 @@ class Overlaps:
         model, data = self._model, self._data
         position = translation + apply(rotation, self._position[part])
         turn = (rotation @ self._rotation[part]).reshape(-1, 9)
-        contacts = []
+        contacts = [(np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, 3)))]
         for first in range(0, len(part), _PAIRS):
             rows = slice(first, first + _PAIRS)
             count = 2 * len(part[rows])
@@ -367,8 +367,6 @@ class Overlaps:
                 row, distance, normal = contact.geom[:, 0] // 2, contact.dist.copy(), contact.frame[:, :3].copy()
             inside = distance < 0
             contacts.append((first + row[inside].astype(np.int64), -distance[inside], normal[inside]))
-        if not contacts:
-            return np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, 3))
         row, depth, normal = (np.concatenate(column) for column in zip(*contacts, strict=True))
         return row, depth, normal
 

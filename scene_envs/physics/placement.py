@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from scene_envs.arrays import Array, Index, Mask, ranges
 from scene_envs.physics.parts import SIZE_CLASSES, LibraryGeometry, PartTable, Rows, apply, times
@@ -274,11 +276,5 @@ def simulation_units(objects: Objects, pairs: ObjectPairs, count: int) -> Array:
 
 def components(count: int, first: Index, second: Index) -> Index:
     """(count,) number of the connected component of each node, edges given as (P,), (P,)."""
-    lowest = np.arange(count)  # number of a node of the same component
-    while True:
-        least = np.minimum(lowest[first], lowest[second])
-        if (least == lowest[first]).all() and (least == lowest[second]).all():
-            return np.unique(lowest, return_inverse=True)[1]  # type: ignore[no-any-return]
-        np.minimum.at(lowest, first, least)
-        np.minimum.at(lowest, second, least)
-        lowest = lowest[lowest]
+    edges = csr_array((np.ones(len(first)), (first, second)), shape=(count, count))
+    return connected_components(edges, directed=False)[1].astype(np.int64)  # type: ignore[no-any-return]

@@ -10,7 +10,7 @@ from itertools import accumulate
 from typing import Any
 
 from scene_envs.assets.base import Asset, AssetLibrary
-from scene_envs.errors import InvalidInputError
+from scene_envs.errors import WORKERS
 from scene_envs.physics.engines import engine_name
 from scene_envs.physics.kernels import KERNELS, Chunk
 from scene_envs.physics.parts import library_geometry
@@ -18,8 +18,6 @@ from scene_envs.scene_types import SceneType
 from scene_envs.workers import Task, WorkerFailure, WorkerPool
 
 _LOGGER = logging.getLogger(__name__)
-_NO_MESH: Any = None
-"""In place of an asset's mesh: workers draw nothing, so meshes are not sent to them."""
 _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """One thread for each worker: there are as many workers as a user wants threads."""
 
@@ -104,7 +102,8 @@ class PhysicsPool(WorkerPool):
 
 
 def _scene_type_message(key: int, scene_type: SceneType) -> tuple[Any, ...]:
-    assets = tuple(dataclasses.replace(asset, visual=_NO_MESH) for asset in scene_type.library)
+    no_mesh: Any = None  # workers draw nothing, so meshes are not sent to them
+    assets = tuple(dataclasses.replace(asset, visual=no_mesh) for asset in scene_type.library)
     return "scene_type", key, dataclasses.replace(scene_type), assets
 
 
@@ -127,10 +126,6 @@ def make_pool(workers: int | str, timeout: float = 60.0, physics: str = "auto") 
     >>> make_pool(0).workers
     0
     """
-    if workers == "ray":
-        return PhysicsPool(None, timeout, physics, ray=True)
-    if not isinstance(workers, int):
-        raise InvalidInputError(
-            f"workers={workers!r}: give a number of processes, 0 for none, or ray for a Ray cluster"
-        )
-    return PhysicsPool(workers, timeout, physics)
+    WORKERS.check("", "workers", workers, False)
+    number = None if isinstance(workers, str) else workers
+    return PhysicsPool(number, timeout, physics, ray=number is None)

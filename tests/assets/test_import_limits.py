@@ -102,8 +102,7 @@ def test_coacd_is_ended_when_the_time_of_the_file_is_over(tmp_path: Path, monkey
     torus.vertices += 0.002 * np.sin(90 * torus.vertices[:, ::-1])
     torus.export(listed(tmp_path, "knotty.stl"))
     monkeypatch.setenv("SCENE_ENVS_IMPORT_SECONDS", "1")
-    settings = decomposition.coacd_settings(0.05)
-    monkeypatch.setattr(decomposition, "coacd_settings", lambda threshold: settings | {"mcts_iterations": 10**6})
+    monkeypatch.setitem(decomposition.COACD_SETTINGS, "mcts_iterations", 10**6)
     text = refused(tmp_path, "took longer than 1 s, CoACD decomposing .*`decomposition: convex`.*IMPORT_SECONDS")
     assert "knotty.stl" in text
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 import dataclasses
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
@@ -24,7 +25,6 @@ from scene_envs.assets.importing.mesh_files import (
     heavier,
     merged_inertial,
     moved_inertial,
-    pose_of,
 )
 from scene_envs.assets.importing.robot_files import read_mjcf, read_sdf, read_urdf, read_usd
 from scene_envs.assets.importing.solids import (
@@ -37,7 +37,7 @@ from scene_envs.assets.importing.solids import (
     thickness,
     visual_of,
 )
-from scene_envs.assets.shapes import MassProperties, join, mass_properties, moved
+from scene_envs.assets.shapes import MassProperties, join, mass_properties, moved, pose_of
 from scene_envs.errors import Checked, CorruptFileError, InvalidInputError, Limit, Positive, unknown_name
 from scene_envs.files import read_yaml
 
@@ -173,11 +173,8 @@ def _entry(item: Any, where: str, folder: Path) -> AssetEntry:
 
 def _color(value: Any, where: str) -> Color:
     """(r, g, b) from a list of three integers, or from "#rrggbb"."""
-    if isinstance(value, str) and value.startswith("#") and len(value) == 7:
-        try:
-            return (int(value[1:3], 16), int(value[3:5], 16), int(value[5:7], 16))
-        except ValueError:
-            pass
+    if isinstance(value, str) and re.fullmatch("#[0-9a-fA-F]{6}", value):
+        return (int(value[1:3], 16), int(value[3:5], 16), int(value[5:7], 16))
     is_list = isinstance(value, list) and len(value) == 3
     if is_list and all(isinstance(v, int) and not isinstance(v, bool) and 0 <= v <= 255 for v in value):
         return (value[0], value[1], value[2])
@@ -299,10 +296,7 @@ class ImportReport:
 
     def __getitem__(self, name: str) -> AssetReport:
         """The report of the asset called ``name``; KeyError without one."""
-        for report in self.assets:
-            if report.name == name:
-                return report
-        raise KeyError(name)
+        return {report.name: report for report in self.assets}[name]
 
     def __str__(self) -> str:
         return "\n".join([f"{self.folder}: {len(self.assets)} assets", *self.notes, *map(str, self.assets)])

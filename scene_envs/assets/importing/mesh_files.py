@@ -92,13 +92,6 @@ class Model:
     faults: tuple[str, ...] = ()  # what is wrong with joints, which are frozen
 
 
-def pose_of(translation: Array, rotation: Array) -> Array:
-    """(4, 4) from a translation (3,) m and a rotation (3, 3)."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, translation
-    return pose
-
-
 def moved_inertial(pose: Array, inertial: MassProperties) -> MassProperties:
     """The inertial of a link in the frame that ``pose`` (4, 4) maps to."""
     turn = pose[:3, :3]
@@ -139,8 +132,6 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
         )
     if not path.is_file():
         raise InvalidInputError(f"{path} does not exist")
-    _check_content(path)
-    check_file(path)
     import trimesh
 
     content = _Content(path)
@@ -183,7 +174,11 @@ class _Content:
 
     def __init__(self, path: Path) -> None:
         self.path, self.type = path, path.suffix.lower()[1:]
-        self.data = path.read_bytes()
+        self.data = _read(path)
+        if not self.data:
+            raise CorruptFileError(f"{path} is empty")
+        if self.data.startswith(b"version https://git-lfs"):
+            raise CorruptFileError(f"{path} is a Git LFS pointer, not the mesh itself; fetch it with `git lfs pull`")
         self.axes, self.upright = np.eye(3), np.eye(3)  # to the axes and unit of its meshes, and from these to z up
         self.notes: list[str] = []  # what is not loaded
         self.scales: list[float] = []  # of the geometries, in the order of trimesh; 1 where there are fewer
@@ -477,16 +472,13 @@ def _cut_again(mesh: Any) -> None:
             mesh.faces = corners[cut_polygons(np.asarray(mesh.vertices), corners, counts)[0]]
 
 
-def _check_content(path: Path) -> None:
+def _read(path: Path) -> bytes:
+    """The content of a file; CorruptFileError where it cannot be read, and errors as of :func:`check_file`."""
+    check_file(path)
     try:
-        with path.open("rb") as file:
-            start = file.read(64)
+        return path.read_bytes()
     except OSError as error:
         raise CorruptFileError(f"{path} cannot be read: {error.strerror or error}") from error
-    if not start:
-        raise CorruptFileError(f"{path} is empty")
-    if start.startswith(b"version https://git-lfs"):
-        raise CorruptFileError(f"{path} is a Git LFS pointer, not the mesh itself; fetch it with `git lfs pull`")
 
 
 def _check_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
@@ -732,11 +724,7 @@ def read_xml(path: Path) -> Element:
     before the declaration, as in other readers. Raises CorruptFileError, with the line, for a file that cannot be read
     or is no XML, and as :func:`check_file` does.
     """
-    check_file(path)
-    try:
-        return _parsed(path.read_bytes(), path)
-    except OSError as error:
-        raise CorruptFileError(f"{path} cannot be read: {error.strerror or error}") from error
+    return _parsed(_read(path), path)
 
 
 def _parsed(data: bytes, path: Path) -> Element:

@@ -29,12 +29,11 @@ from scene_envs.assets.importing.mesh_files import (
     merged_inertial,
     moved_inertial,
     numbers,
-    pose_of,
     positive,
     read_xml,
 )
 from scene_envs.assets.importing.solids import solid_of
-from scene_envs.assets.shapes import MassProperties
+from scene_envs.assets.shapes import MassProperties, pose_of
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
 
 _Colors = Mapping[str, Color | None]
@@ -469,42 +468,33 @@ def read_mjcf(path: Path) -> Model:
     root = roots[0] if roots else 0  # the world itself where it holds all geoms
     bodies = [body for body in range(model.nbody) if root in (0, int(model.body_rootid[body]))]
     base = np.linalg.inv(pose_of(data.xpos[root], data.xmat[root].reshape(3, 3)))
-    visuals: list[Shape] = []
-    collisions: list[Shape] = []
-    notes = _unread(fromstring(spec.to_xml()), "MJCF")
-    rows, joints, frozen = _hinges(model, data, root, bodies, base)
+    reading = _Reading(fromstring(spec.to_xml()), "MJCF", path)
+    rows, reading.joints, reading.frozen = _hinges(model, data, root, bodies, base)
     for geom in range(model.ngeom):
         name = f"geom {model.geom(geom).name or geom!r}"
         shape = _geom(model, geom, base @ pose_of(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)), path, name)
         if shape is None or int(model.geom_bodyid[geom]) not in bodies:
             kind, body = mujoco.mjtGeom(model.geom_type[geom]).name[7:].lower(), model.geom_bodyid[geom]
-            notes.append(f"{name}, a {kind} of body {model.body(body).name!r}, is left out")
+            reading.notes.append(f"{name}, a {kind} of body {model.body(body).name!r}, is left out")
             continue
         shape = replace(shape, link=rows[int(model.geom_bodyid[geom])])
         if collides := bool(model.geom_contype[geom] | model.geom_conaffinity[geom]):
-            collisions.append(shape)
+            reading.shapes["collision"].append(shape)
         if model.geom_group[geom] <= 2 or not collides:  # MuJoCo draws the groups 0 to 2
-            visuals.append(shape)
-    inertials = []
+            reading.shapes["visual"].append(shape)
     for body in (body for body in bodies if model.body_mass[body] > 0):
         pose = base @ pose_of(data.xipos[body], data.ximat[body].reshape(3, 3))
         own = MassProperties(float(model.body_mass[body]), np.zeros(3), np.diag(model.body_inertia[body]))
-        inertials.append((rows[body], moved_inertial(pose, own)))
+        reading.inertials.append((rows[body], moved_inertial(pose, own)))
     if ((model.geom_contype | model.geom_conaffinity) & ~1).any():
-        notes.append("not read: contype and conaffinity above 1, because all objects of a scene collide")
-    if joints and any(getattr(model, key).any() for key in ("dof_armature", "jnt_stiffness")):
-        notes.append("not read: armature and stiffness of joints")
-    if frozen:
-        notes.append(f"movable joints frozen at zero: {', '.join(frozen)}")
+        reading.notes.append("not read: contype and conaffinity above 1, because all objects of a scene collide")
+    if reading.joints and any(getattr(model, key).any() for key in ("dof_armature", "jnt_stiffness")):
+        reading.notes.append("not read: armature and stiffness of joints")
     free = [j for j in range(model.njnt) if model.jnt_type[j] == 0 and model.jnt_bodyid[j] == root]
     drags = ("dof_armature", "dof_damping", "dof_frictionloss", "jnt_stiffness") if free else ()
     drag = [key[4:] for key in drags if getattr(model, key)[free[0]].any()]
-    notes += [f"not read: {name} of the free joint" for name in drag]
-    if not free:
-        notes.append("it has no free joint: it is welded (`welded: false` makes it free)")
-    return Model(
-        tuple(visuals), tuple(collisions), tuple(inertials), None if free else True, tuple(notes), tuple(joints)
-    )
+    reading.notes += [f"not read: {name} of the free joint" for name in drag]
+    return reading.model("" if free else "it has no free joint")
 
 
 def _hinges(

@@ -54,6 +54,18 @@ _COARSE_CORNERS = 16
 _DIRECTIONS = np.array(list(np.ndindex(3, 3, 3)), dtype=np.float64) - 1.0
 """Directions to the 26 neighbours of a cell, and the zero vector."""
 Method = Literal["auto", "coacd", "convex"]
+COACD_SETTINGS = {
+    "max_convex_hull": 32,
+    "preprocess_resolution": 30,
+    "resolution": 1000,
+    "mcts_nodes": 10,
+    "mcts_iterations": 30,
+    "mcts_max_depth": 2,
+    "max_ch_vertex": MAX_CORNERS,
+    "decimate": True,
+    "seed": 0,
+}
+"""Keywords of ``coacd.run_coacd`` besides the threshold of concavity."""
 _LOGGER = logging.getLogger(__name__)
 _VERSION = 2
 """Version of the format on disk."""
@@ -101,16 +113,6 @@ def few_cornered_hull(points: Array, tolerance: float, corners: int = MAX_CORNER
             return convex_hull(full.vertices[chosen]), max(0.0, float(outside[worst]))
         chosen.append(int(rows[worst]))
         rows, cloud = rows[outside > -1e-9], cloud[outside > -1e-9]  # what is inside stays inside a growing hull
-
-
-def concavity(points: Array, hull: ConvexPart) -> float:
-    """Largest depth (m) of the points (P, 3) below the surface of ``hull``."""
-    planes = ConvexHull(hull.vertices).equations
-    deepest = 0.0
-    for start in range(0, len(points), 4096):
-        gaps = points[start : start + 4096] @ planes[:, :3].T + planes[:, 3]
-        deepest = max(deepest, float((-gaps).min(axis=1).max()))
-    return deepest
 
 
 def enclosing_hull(parts: Sequence[ConvexPart]) -> ConvexPart:
@@ -232,12 +234,18 @@ def _hull(points: Array, tolerance: float) -> ConvexPart:
 
 
 def _depth(body: trimesh.Trimesh, hull: ConvexPart) -> float:
-    return concavity(np.concatenate([body.vertices, body.triangles_center]), hull)
+    """Largest depth (m) of corners and middles of triangles of a body below the surface of ``hull``."""
+    points, planes = np.concatenate([body.vertices, body.triangles_center]), ConvexHull(hull.vertices).equations
+    deepest = 0.0
+    for start in range(0, len(points), 4096):
+        gaps = points[start : start + 4096] @ planes[:, :3].T + planes[:, 3]
+        deepest = max(deepest, float((-gaps).min(axis=1).max()))
+    return deepest
 
 
 def _decompose(body: trimesh.Trimesh, method: Method, threshold: float, what: str) -> list[Array] | None:
     """Corners of the convex pieces of a concave body, from the cache where possible; None without CoACD."""
-    settings = coacd_settings(threshold)
+    settings = {"threshold": threshold, **COACD_SETTINGS}
     path = cache_folder() / "decompositions" / f"{_key(body, settings)}.npz"
     pieces = _read(path)
     if pieces is not None:
@@ -257,22 +265,6 @@ def _decompose(body: trimesh.Trimesh, method: Method, threshold: float, what: st
         raise InvalidInputError(f"CoACD found no convex parts in {what}; set `decomposition: convex` for it")
     _write(path, pieces)
     return pieces
-
-
-def coacd_settings(threshold: float) -> dict[str, Any]:
-    """Keywords of ``coacd.run_coacd`` for a concavity threshold."""
-    return {
-        "threshold": threshold,
-        "max_convex_hull": 32,
-        "preprocess_resolution": 30,
-        "resolution": 1000,
-        "mcts_nodes": 10,
-        "mcts_iterations": 30,
-        "mcts_max_depth": 2,
-        "max_ch_vertex": MAX_CORNERS,
-        "decimate": True,
-        "seed": 0,
-    }
 
 
 def run_coacd(vertices: Array, faces: Array, settings: dict[str, Any], what: str) -> list[Array]:

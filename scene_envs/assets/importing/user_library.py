@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import logging
 import os
 import re
@@ -32,7 +31,7 @@ from scene_envs.assets.importing.limits import (
     timed,
     too_slow,
 )
-from scene_envs.assets.importing.mesh_files import Color, find_mesh, read_xml
+from scene_envs.assets.importing.mesh_files import MESH_SUFFIXES, Color, find_mesh, read_xml
 from scene_envs.assets.importing.robot_files import open_stage
 from scene_envs.assets.importing.solids import audit_parts
 from scene_envs.assets.recipes import RECIPES
@@ -40,7 +39,6 @@ from scene_envs.errors import InvalidInputError, SceneEnvsError
 from scene_envs.workers import WorkerFailure, run_apart
 
 _LOGGER = logging.getLogger(__name__)
-_DESCRIPTIONS = (".urdf", ".sdf", ".xml", ".usd", ".usda", ".usdc")
 
 
 def load_library(folder: str | os.PathLike[str]) -> AssetLibrary:
@@ -138,7 +136,7 @@ def _listed(path: Path, stamp: tuple[int, int]) -> FolderIndex:
 def _unlisted(folder: Path, stamp: tuple[int, int]) -> FolderIndex:
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
     files = [path for path in files if path.suffix.lower() != ".xml" or re.search(rb"<mujoco[\s>]", path.read_bytes())]
-    used = {mesh for path in files if path.suffix.lower() in _DESCRIPTIONS for mesh in _named_files(path)}
+    used = {mesh for path in files if path.suffix.lower() not in MESH_SUFFIXES for mesh in _named_files(path)}
     entries = [default_entry(str(path.relative_to(folder))) for path in files if path.resolve() not in used]
     if not entries:
         raise InvalidInputError(f"{folder} holds no {', '.join(SUFFIXES)} files")
@@ -176,9 +174,7 @@ def _colored(entries: list[AssetEntry]) -> tuple[AssetEntry, ...]:
     chosen: list[Color] = [entry.color for entry in entries if entry.color is not None]
     taken = [*(recipe.color for recipe in RECIPES.values()), *chosen]
     fresh = iter(distinct_colors(len(entries) - len(chosen), taken))
-    return tuple(
-        entry if entry.color is not None else dataclasses.replace(entry, color=next(fresh)) for entry in entries
-    )
+    return tuple(entry if entry.color is not None else replace(entry, color=next(fresh)) for entry in entries)
 
 
 def build_in_time(request: tuple[Path, AssetEntry]) -> tuple[Asset, AssetReport]:

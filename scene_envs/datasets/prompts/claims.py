@@ -172,9 +172,7 @@ class SideClaim:
     def check(self, scene: SceneFacts) -> ClaimCheck:
         first, second = self.subject.resolve(scene), self.landmark.resolve(scene)
         there = [index for index in (first, second) if index >= 0]
-        holds = len(there) == 2 and (
-            scene.is_next_to(first, second) if self.side == "next" else scene.is_aside(self.side, first, second)
-        )
+        holds = len(there) == 2 and scene.is_at(self.side, first, second)
         score = 1.0 if holds else 0.25 * len(there)
         return ClaimCheck(self, 1, int(holds), score, tuple(int(slot) for slot in scene.slots[there]))
 

@@ -128,6 +128,10 @@ class SceneFacts:
             below = int(self.held.support[below])
         return below == lower and below >= 0
 
+    def is_at(self, side: str, first: int, second: int) -> bool:
+        """Whether ``first`` is to the given side of ``second``, or close to it for the side ``next``."""
+        return self.is_next_to(first, second) if side == "next" else self.is_aside(side, first, second)
+
     def is_aside(self, side: str, first: int, second: int) -> bool:
         """Whether ``first`` is to the given side of ``second``."""
         offset = self.positions[first] - self.positions[second]

@@ -204,18 +204,13 @@ class _Writer:
 
     def _aside(self) -> Claim | None:
         first, second = self._neighbors[self.rng.integers(len(self._neighbors))].tolist()
-        sides = [side for side in get_args(Side) if self._is_side(side, first, second)]
+        sides = [side for side in get_args(Side) if all(view.is_at(side, first, second) for view in self.views)]
         subject = self._refer(first) if sides else None
         landmark = self._refer(second) if subject is not None else None
         if subject is None or landmark is None:
             return None
         claim = SideClaim(subject, self._pick(sides), landmark)
         return None if _repeats_order(claim) else claim
-
-    def _is_side(self, side: Side, first: int, second: int) -> bool:
-        if side == "next":
-            return all(view.is_next_to(first, second) for view in self.views)
-        return all(view.is_aside(side, first, second) for view in self.views)
 
     def _references(self, index: int) -> list[Reference]:
         """The simplest expressions for one object, which single it out in every view; empty when there are none. These
