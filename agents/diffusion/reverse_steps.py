@@ -231,4 +231,4 @@ def concatenate_steps(parts: Sequence[ReverseStep]) -> ReverseStep:
             return columns[0]
         return None if any(column is None for column in columns) else torch.cat(columns)
 
-    return first._make(map(joined, first._fields))
+    return type(first)(*map(joined, first._fields))  # type: ignore[arg-type]
