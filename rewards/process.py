@@ -120,7 +120,7 @@ class IsolatedReward:
         def tensor(array: Any) -> Any:
             return torch.from_numpy(np.array(array)).to(batch.tensor.device)
 
-        return RewardOutput(**_each(tensor, np.ndarray, body))
+        return RewardOutput(**mapped(tensor, np.ndarray, body))
 
     def maximum(self, slots: int, free_slots: int) -> float | None:
         """The largest value that the reward declares; see :func:`rewards.base.declared_maximum`."""
@@ -239,14 +239,14 @@ class RewardRunner:
         context = RewardContext(prompts=prompts, pool=self.pool, seed=seed)
         with other_draw(draw):
             output = evaluate_reward(self.reward, batch, context, strict=True)
-        fields: dict[str, Any] = _each(lambda tensor: tensor.cpu().numpy(), torch.Tensor, vars(output))
+        fields: dict[str, Any] = mapped(lambda tensor: tensor.cpu().numpy(), torch.Tensor, vars(output))
         return fields
 
 
-def _each(change: Callable[[Any], Any], kind: type, part: Any) -> Any:
+def mapped(change: Callable[[Any], Any], kind: type, part: Any) -> Any:
     """``part`` with ``change`` applied to what is of this ``kind``, in mappings too."""
     if isinstance(part, Mapping):
-        return {name: _each(change, kind, value) for name, value in part.items()}
+        return {name: mapped(change, kind, value) for name, value in part.items()}
     return change(part) if isinstance(part, kind) else part
 
 

@@ -334,6 +334,13 @@ def page_part(package: str, name: str) -> str:
 
 
 @cache
+def page_values(package: str, name: str) -> dict[str, Any]:
+    """The mapping in a YAML file in the folder of ``package``."""
+    values: dict[str, Any] = yaml.safe_load(page_part(package, name))
+    return values
+
+
+@cache
 def page_template(package: str, name: str, *, trim_blocks: bool = False) -> Template:
     """The template in a file of ``package``, which may extend another one there. It escapes all text; its filter
     ``png`` gives a file in base 64.

@@ -709,6 +709,16 @@ class RewardLimitKeys(Checked):
 
     reward_limits: RewardLimits = nested(RewardLimits, one_key=True)
 
+    def running(self, reward: Any) -> Any:
+        """``reward`` as :func:`rewards.process.run_reward` gives it, under these limits and the keys ``seed``,
+        ``workers`` and ``physics`` of the command; its caller closes it.
+        """
+        from rewards.process import run_reward
+
+        keys: Any = self
+        workers = 0 if keys.workers == "ray" else keys.workers
+        return run_reward(reward, seed=keys.seed, workers=workers, physics=keys.physics, **vars(self.reward_limits))
+
 
 @dataclass
 class OutputKeys(EngineKeys, DeviceKeys):

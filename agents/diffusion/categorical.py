@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -54,28 +54,20 @@ def _mask_and_replace(num_timesteps: int) -> tuple[Tensor, Tensor]:
     return torch.cat([one, keep]), torch.cat([0.0 * one, mask])
 
 
-def _early_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """Masks an equal share of original categories per timestep (Austin et al. 2021, app. A.2.2), but from T/2 on: a
-    reverse chain draws all categories in its first half.
+def _absorbing(num_timesteps: int, power: int) -> tuple[Tensor, Tensor]:
+    """With power 1, masks an equal share of original categories per timestep (Austin et al. 2021, app. A.2.2), but from
+    T/2 on: a reverse chain draws all categories in its first half. Power 2 unmasks the last categories one at a time,
+    as the cosine of MaskGIT does (Chang et al. 2022): categories of the same step are drawn independently, which makes
+    counts inexact.
     """
     u = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
-    mask = torch.maximum(1e-5 * u, (u - 0.5) / 0.5)
-    return 1.0 - mask, mask
-
-
-def _squared_absorbing(num_timesteps: int) -> tuple[Tensor, Tensor]:
-    """The kernel ``early_absorbing`` with a quadratic schedule, which unmasks the last categories one at a time, as the
-    cosine of MaskGIT does (Chang et al. 2022): categories of the same step are drawn independently, which makes counts
-    inexact.
-    """
-    u = torch.linspace(0, 1, num_timesteps + 1, dtype=torch.float64)
-    mask = torch.maximum(1e-5 * u, ((u - 0.5) / 0.5).clamp(min=0.0) ** 2)
+    mask = torch.maximum(1e-5 * u, ((u - 0.5) / 0.5).clamp(min=0.0) ** power)
     return 1.0 - mask, mask
 
 
 CATEGORICAL_KERNELS: dict[str, Callable[[int], tuple[Tensor, Tensor]]] = {
-    "early_absorbing": _early_absorbing,
-    "squared_absorbing": _squared_absorbing,
+    "early_absorbing": partial(_absorbing, power=1),
+    "squared_absorbing": partial(_absorbing, power=2),
     "mask_and_replace": _mask_and_replace,
 }
 

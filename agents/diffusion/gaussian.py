@@ -464,10 +464,7 @@ class StepTable:
             raise InvalidInputError(f"num_steps={num_steps!r} must be a whole number in 1..{num_timesteps}")
         if not 1 <= num_steps <= num_timesteps:
             raise InvalidInputError(f"num_steps={num_steps} is outside 1..{num_timesteps}, the prior's timesteps")
-        if num_steps == 1:
-            t = torch.tensor([num_timesteps])
-        else:
-            t = torch.linspace(num_timesteps - 1, 0, num_steps, dtype=torch.float64).round().long() + 1
+        t = torch.linspace(num_timesteps - 1, 0, num_steps, dtype=torch.float64).round().long() + 1
         return cls(t, torch.cat([t[1:], torch.zeros(1, dtype=torch.int64)]))
 
     @classmethod

@@ -222,19 +222,13 @@ def concatenate_steps(parts: Sequence[ReverseStep]) -> ReverseStep:
     first = parts[0]
     if len(parts) == 1:
         return first
-    if isinstance(first, GaussianStep):
-        normal = [part for part in parts if isinstance(part, GaussianStep)]
-        return GaussianStep(torch.cat([part.mean for part in normal]), first.std, _all_estimates(parts))
-    if isinstance(first, MixedStep):
-        mixed = [part for part in parts if isinstance(part, MixedStep)]
-        mean, probs = (torch.cat([getattr(part, name) for part in mixed]) for name in ("mean", "probs"))
-        masked = None if first.masked is None else torch.cat([part.masked for part in mixed if part.masked is not None])
-        groups = None if first.groups is None else torch.cat([part.groups for part in mixed if part.groups is not None])
-        return MixedStep(mean, first.pose_std, probs, first.random, masked, _all_estimates(parts), groups)
-    raise TypeError(f"cannot concatenate steps of type {type(first).__name__}")
+    if not isinstance(first, GaussianStep | MixedStep):
+        raise TypeError(f"cannot concatenate steps of type {type(first).__name__}")
 
+    def joined(name: str) -> Tensor | None:
+        columns = [getattr(part, name) for part in parts]
+        if name in ("std", "pose_std", "random"):  # the same for all scenes
+            return columns[0]
+        return None if any(column is None for column in columns) else torch.cat(columns)
 
-def _all_estimates(parts: Sequence[ReverseStep]) -> Tensor | None:
-    """The denoised scenes of all parts; None if any part has none."""
-    known = [part.denoised for part in parts if part.denoised is not None]
-    return torch.cat(known) if len(known) == len(parts) else None
+    return type(first)(*map(joined, first._fields))  # type: ignore[arg-type]

@@ -6,9 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
-from typing import Any
+from functools import partial
 
 import numpy as np
 import torch
@@ -16,6 +14,7 @@ from torch import Tensor
 
 from scene_envs.arrays import Array, Index
 from scene_envs.errors import InvalidInputError
+from scene_envs.files import page_values
 from scene_envs.scene import (
     PlacedObjects,
     SceneBatch,
@@ -262,13 +261,8 @@ class Support:
     catch: float = 0.0  # height error (m) up to which a rider within reach is assigned here; for thin supports
 
 
-@cache
-def _tables() -> dict[str, Any]:
-    """Supports of scene types, and containers."""
-    import yaml
-
-    found: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("supports.yaml").read_text("utf-8"))
-    return found
+_tables = partial(page_values, "agents.evaluation", "supports.yaml")
+"""Supports of scene types, and containers."""
 
 
 def supports_of(scene_type: str) -> list[Support]:

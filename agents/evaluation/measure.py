@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +37,7 @@ from scene_envs.datasets.prompts import KINDS, describe, parse_prompt, scene_fac
 from scene_envs.datasets.prompts.claims import NameCount, ObjectCount
 from scene_envs.envs.scoring import resolve_prior
 from scene_envs.errors import InvalidInputError, unknown_name
+from scene_envs.files import page_values
 from scene_envs.protocols import PriorLike
 from scene_envs.scene import SceneBatch
 from scene_envs.scene_types import SceneType
@@ -386,19 +386,11 @@ def how_to_read(name: str) -> str:
     >>> how_to_read("height_error_stack_mm")
     'median distance in height to the support (stack); lower is better'
     """
-    for pattern, text in _reading().items():
+    for pattern, text in page_values("agents.evaluation", "reading.yaml").items():
         found = re.fullmatch(pattern, name)
         if found:
-            return text.format(*found.groups())
+            return str(text).format(*found.groups())
     return ""
-
-
-@cache
-def _reading() -> dict[str, str]:
-    import yaml
-
-    found: dict[str, str] = yaml.safe_load(Path(__file__).with_name("reading.yaml").read_text("utf-8"))
-    return found
 
 
 def _number(value: float | None) -> str:

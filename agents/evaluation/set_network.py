@@ -158,8 +158,7 @@ def _at(values: Tensor, index: Tensor) -> Tensor:
 
 def _padded(values: Tensor, dim: int, size: int, fill: float) -> Tensor:
     """``values`` with ``fill`` up to ``size`` along ``dim``."""
-    extra = values.new_full((*values.shape[:dim], size - values.shape[dim], *values.shape[dim + 1 :]), fill)
-    return torch.cat([values, extra], dim=dim)
+    return F.pad(values, [0, 0] * (values.ndim - 1 - dim) + [0, size - values.shape[dim]], value=fill)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from agents.networks.flux import timestep_embedding
+from agents.networks.flux_modules import start_at_zero
 from agents.networks.registry import register_network
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import POSE_FEATURES
@@ -83,8 +84,7 @@ def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 def head(hidden: int, outputs: int) -> nn.Sequential:
     """Layer norm and two layers, of which the last starts at zero."""
     last = nn.Linear(hidden, outputs)
-    nn.init.zeros_(last.weight)
-    nn.init.zeros_(last.bias)
+    start_at_zero(last)
     return nn.Sequential(nn.LayerNorm(hidden), nn.Linear(hidden, hidden), nn.GELU(), last)
 
 
@@ -205,8 +205,7 @@ class _AdaptiveNorm(nn.Module):
         super().__init__()
         self.hidden = hidden
         self.modulation = nn.Linear(hidden, 2 * hidden)
-        nn.init.zeros_(self.modulation.weight)
-        nn.init.zeros_(self.modulation.bias)
+        start_at_zero(self.modulation)
 
     def forward(self, tokens: Tensor, condition: Tensor) -> Tensor:
         shift, scale = self.modulation(F.silu(condition)).unsqueeze(1).chunk(2, dim=-1)

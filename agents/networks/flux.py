@@ -31,6 +31,7 @@ from agents.networks.flux_modules import (
     Place,
     PooledTextConfig,
     Scene,
+    start_at_zero,
 )
 from agents.networks.geometry import (
     ContactsConfig,
@@ -90,8 +91,7 @@ class SingleStreamBlock(nn.Module):
         self.query_norm = nn.RMSNorm(hidden // heads, eps=1e-6)
         self.key_norm = nn.RMSNorm(hidden // heads, eps=1e-6)
         self.gathered = nn.Linear(heads * relations, hidden, bias=False) if relations else None
-        nn.init.zeros_(self.modulation.weight)
-        nn.init.zeros_(self.modulation.bias)
+        start_at_zero(self.modulation)
 
     def forward(
         self, tokens: Tensor, condition: Tensor, mask: Tensor | None = None, relations: Tensor | None = None
@@ -169,8 +169,7 @@ class _Stream(nn.Module):
             self.out = nn.Linear(hidden, hidden)
             wide = int(hidden * mlp_ratio)
             self.mlp = nn.Sequential(nn.Linear(hidden, wide), nn.GELU(approximate="tanh"), nn.Linear(wide, hidden))
-        nn.init.zeros_(self.modulation.weight)
-        nn.init.zeros_(self.modulation.bias)
+        start_at_zero(self.modulation)
 
     def rates(self, condition: Tensor) -> tuple[Tensor, ...]:
         """Shift, scale and gate of the attention, then of the MLP, (B, 1, H) each; the first two where text ends."""
@@ -254,9 +253,7 @@ class FluxDenoiser(nn.Module):
         )
         self.final_modulation = nn.Linear(hidden, 2 * hidden)
         self.out = nn.Linear(hidden, config.features)
-        for layer in (self.final_modulation, self.out):
-            nn.init.zeros_(layer.weight)
-            nn.init.zeros_(layer.bias)
+        start_at_zero(self.final_modulation, self.out)
         self.fourier = FourierFeatures(config.frequencies)
         self.body_precision = "float32"
 
@@ -458,9 +455,7 @@ class MixedFlux(nn.Module):
         self.logits_out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, config.categories))
         self._build_modules("output")
         self.body_precision = "float32"
-        for layer in (self.final_modulation, self.pose_out[-1], self.logits_out[-1]):
-            for parameter in layer.parameters():
-                nn.init.zeros_(parameter)
+        start_at_zero(self.final_modulation, self.pose_out[-1], self.logits_out[-1])
         self.unit: Tensor
         self.rotations: Tensor
         self.register_buffer("unit", torch.tensor(config.unit), persistent=False)

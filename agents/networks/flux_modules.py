@@ -59,6 +59,13 @@ class Scene:
     kept: dict[str, Tensor] = field(default_factory=dict)
 
 
+def start_at_zero(*layers: nn.Module) -> None:
+    """Set all weights and biases of ``layers`` to zero."""
+    for layer in layers:
+        for parameter in layer.parameters():
+            nn.init.zeros_(parameter)
+
+
 class FluxModule(nn.Module):
     """A part of the network outside of its core. Every hook may be left out; None adds nothing.
 
@@ -325,8 +332,7 @@ class CountConditioning(FluxModule):
         self.inner = nn.Linear(hidden, hidden)
         self.out = nn.Linear(hidden, 1)
         self.trust = nn.Parameter(torch.ones(()))
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
+        start_at_zero(self.out)
 
     def count_logits(self, tokens: Tensor) -> Tensor:
         """(B, G + 1, most + 1) logits of the numbers of each kind and of all objects, from ``tokens`` (B, G + 1, W)."""

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene
+from agents.networks.flux_modules import FluxModule, ModuleConfig, Scene, start_at_zero
 from scene_envs.errors import unknown_name
 from scene_envs.normalizer import constant_on
 from scene_envs.rotations import quaternion_to_matrix
@@ -71,8 +71,7 @@ class RotationFeatures(FluxModule):
     def __init__(self, embedding: int) -> None:
         super().__init__()
         self.gates = nn.Linear(embedding, ROTATION_FEATURES)
-        nn.init.zeros_(self.gates.weight)
-        nn.init.zeros_(self.gates.bias)
+        start_at_zero(self.gates)
 
     def pose_features(self, scene: Scene) -> Tensor | None:
         if scene.noisy_rotation is None or scene.rotation is None or scene.rotation_noise is None:
@@ -251,8 +250,7 @@ class Relations(FluxModule):
         self.register_buffer("scales", torch.logspace(-2, float(largest.log10()), _SCALES), persistent=False)
         self.hidden = nn.Linear(3 * _SCALES, _PAIR_WIDTH)
         self.out = nn.Linear(_PAIR_WIDTH, blocks * heads)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
+        start_at_zero(self.out)
 
     def relations(self, scene: Scene) -> tuple[Tensor, Tensor] | None:
         if scene.position is None or scene.noise_level is None:
@@ -375,9 +373,7 @@ class Contacts(FluxModule):
         self.gates = nn.Linear(embedding, 3 * CHANNELS)
         self.gap_of: Tensor
         self.register_buffer("gap_of", torch.tensor(_GAP_OF), persistent=False)
-        for layer in (self.out, self.gates):
-            nn.init.zeros_(layer.weight)
-            nn.init.zeros_(layer.bias)
+        start_at_zero(self.out, self.gates)
 
     def messages(self, scene: Scene) -> Tensor | None:
         if scene.metres is None or scene.metres_noise is None or scene.rotation is None or scene.pairs is None:

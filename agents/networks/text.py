@@ -154,8 +154,7 @@ class TextEncoder(nn.Module):
                 raise InvalidInputError(
                     f"the prompt {prompt[:60]!r}… has {len(words)} words; at most {self.config.max_tokens - 1} are read"
                 )
-        longest = max(len(row) for row in rows)
-        return torch.tensor([row + [PADDING] * (longest - len(row)) for row in rows]), unknown
+        return nn.utils.rnn.pad_sequence([torch.tensor(row) for row in rows], True, PADDING), unknown
 
     def unknown_words(self, prompts: Iterable[str]) -> list[str]:
         """Words of ``prompts`` that the vocabulary lacks, sorted.

@@ -90,7 +90,6 @@ class Journal:
         record = buffer.getvalue()
         with self.path.open("ab") as file:
             file.write(_HEAD.pack(len(record), zlib.crc32(record)) + record)
-            file.flush()
 
     def _read(self) -> list[Any]:
         records = []

@@ -85,9 +85,9 @@ def run_demo(
         "seconds": round(time.perf_counter() - started, 1),
         "num_steps": num_steps,
     }
-    if left_out := _left_out(measured):
+    if left_out := {name: reason for part in measured.values() for name, reason in part.left_out.items()}:
         metrics["left_out"] = left_out
-    _write_page(directory, results, measured)
+    _write_page(directory, results, measured, left_out)
     write_json(directory / METRICS_NAME, metrics)
     return metrics
 
@@ -104,10 +104,12 @@ class _Finished:
         self.algorithm = self.config["algorithm"]["name"].upper().replace("_", "-")
 
 
-def _write_page(directory: Path, runs: Mapping[str, _Finished], measured: Mapping[str, Measured]) -> None:
+def _write_page(
+    directory: Path, runs: Mapping[str, _Finished], measured: Mapping[str, Measured], left_out: Mapping[str, str]
+) -> None:
     """Write the report, and its pictures, to ``directory``."""
     raw = {name: (part.raw, None) for name, part in measured.items()}
-    pictures, left_out = {"samples": draw_scenes(raw, directory / "samples.png")}, _left_out(measured)
+    pictures = {"samples": draw_scenes(raw, directory / "samples.png")}
     if "feasible" not in left_out:
         ready = {name: (part.ready, part.is_ready) for name, part in measured.items() if part.ready is not None}
         pictures["ready"] = draw_scenes(ready, directory / "ready.png")
@@ -124,7 +126,3 @@ def _write_page(directory: Path, runs: Mapping[str, _Finished], measured: Mappin
         rows=number_rows(figures),
         settings=config_text({name: run.config for name, run in runs.items()}),
     )
-
-
-def _left_out(measured: Mapping[str, Measured]) -> dict[str, str]:
-    return {name: reason for part in measured.values() for name, reason in part.left_out.items()}

@@ -45,6 +45,7 @@ class Discriminator:
     """
 
     name: ClassVar[str] = "discriminator"
+    maximum: ClassVar[float] = 1.0
     averages_objects: ClassVar[bool] = True
 
     def __init__(self, learning_rate: float = 1e-3, steps: int = 8, batch_size: int = 48, memory: int = 384) -> None:
@@ -59,10 +60,6 @@ class Discriminator:
 
     def __repr__(self) -> str:
         return "Discriminator()"
-
-    def maximum(self, slots: int, free_slots: int) -> float:
-        """The largest value, 1."""
-        return 1.0
 
     def __call__(self, batch: SceneBatch, context: RewardContext) -> RewardOutput:
         """Mean over the free objects. Term: ``free_objects``.

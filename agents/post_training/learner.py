@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Generator, nn
+from torch import Generator, Tensor, nn
 
 from agents.configuration.composition import MAX_GRADIENT_NORM
 from agents.post_training.algorithms.base import Algorithm, gradient_norm
@@ -27,7 +27,7 @@ from agents.priors.prior import ScenePrior
 from agents.utils.process_group import ProcessGroup, gather_rows
 from rewards import RewardContext, RewardOutput, facts_of, learned_parts, reward_name
 from rewards.evaluation import evaluate_reward
-from rewards.process import close_reward
+from rewards.process import close_reward, mapped
 from scene_envs.arrays import Result, within_memory
 from scene_envs.envs import DenoisingTorchRLEnv
 from scene_envs.envs.scoring import RewardScorer
@@ -252,14 +252,7 @@ class WholeBatchReward:
             prompts = tuple(text for texts in self._processes.gather(tuple(prompts)) for text in texts)
         output = evaluate_reward(self._reward, everything, replace(context, prompts=prompts))
         rows = self._processes.rows(len(everything))
-        return replace(
-            output,
-            value=output.value[rows],
-            valid=None if output.valid is None else output.valid[rows],
-            per_object=None if output.per_object is None else output.per_object[rows],
-            terms={name: term[rows] for name, term in output.terms.items()},
-            object_flags={name: flags[rows] for name, flags in output.object_flags.items()},
-        )
+        return RewardOutput(**mapped(lambda column: column[rows], Tensor, vars(output)))
 
 
 class NonFiniteGradient(Exception):

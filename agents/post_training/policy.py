@@ -145,10 +145,8 @@ class DenoisingPolicy(TensorDictModuleBase):
                 continue
             part_text = None if text is None else (text[0][rows], text[1][rows])
             action[rows], log_prob[rows] = self.draw(scene[rows], self.step_of(t), text=part_text)
-        tensordict.set("action", action)
-        tensordict.set("action_log_prob", log_prob.sum(dim=-1))
-        tensordict.set("slot_log_prob", log_prob)
-        return tensordict
+        found = {"action": action, "action_log_prob": log_prob.sum(dim=-1), "slot_log_prob": log_prob}
+        return tensordict.update(found)
 
 
 def gradient_weights(stds: Tensor, *, min_std: float = 1e-2) -> Tensor:

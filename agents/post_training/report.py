@@ -101,7 +101,7 @@ def post_train_and_compare(
         real = run_prompts(directory, batch, stream_seed(config.seed, "bank"))
         deck = PromptDeck.of(base, config.prompt, 1, slots, real, len(batch))
         prompts = deck.deal(scenes, Generator().manual_seed(seed))
-    reward = config.resolved_reward()
+    reward = config.running(config.reward)
     with make_pool(config.workers, PHYSICS_TIMEOUT, config.physics) as pool, ExitStack() as stack:
         stack.callback(close_reward, reward)
         load_learned_rewards(reward, directory, config.guard.scenes, config.seed)
@@ -193,9 +193,9 @@ def measure_prior(
     ).to("cpu")
     left_out: dict[str, str] = {}
     ready: ReadyResult | None = None
-    scored: RewardOutput | None = None
     counts = raw.counts.double()
     judged: dict[str, float] = {}
+    rated: dict[str, float] = {}
     with leaving_out("feasible", left_out):
         feasible = feasibility(raw, pool=pool)
         ready = make_ready(raw, pool=pool)
@@ -208,19 +208,17 @@ def measure_prior(
     if reward is not None:
         with leaving_out("reward", left_out):
             scored = evaluate_reward(reward, raw, context)
+            rated = {**_mean("reward", scored), "reward_invalid": float((~scored.is_valid).sum())}
     figures = {
         "scenes": float(count),
         "objects": float(counts.mean()),
         "objects_sem": _standard_error(counts),
-        **({} if scored is None else _mean("reward", scored)),
-        **({} if scored is None else {"reward_invalid": float((~scored.is_valid).sum())}),
+        **rated,
         **judged,
         **realism(raw),
-        **({} if prompts is None else _mean("prompt_match", PromptMatch()(raw, RewardContext(prompts=tuple(prompts))))),
+        **({} if prompts is None else _mean("prompt_match", PromptMatch()(raw, context))),
     }
-    if ready is None:
-        return Measured(figures, raw, None, None, left_out)
-    return Measured(figures, raw, ready.batch, ready.ready, left_out)
+    return Measured(figures, raw, ready and ready.batch, ready.ready if ready else None, left_out)
 
 
 def _counted(name: str, batch: SceneBatch, counts: Tensor, valid: Tensor) -> dict[str, float]:

@@ -465,18 +465,6 @@ class PostTrainConfig(GuidanceKeys, SamplingKeys, EngineKeys, TrainingKeys, Prog
         """The run directory."""
         return Path(self.output or "runs/post-train")
 
-    def resolved_reward(self) -> Any:
-        """The reward of a run, as :func:`rewards.process.run_reward` gives it; its caller closes it."""
-        from rewards.process import run_reward
-
-        return run_reward(
-            self.reward,
-            seed=self.seed,
-            **vars(self.reward_limits),
-            workers=0 if self.workers == "ray" else self.workers,
-            physics=self.physics,
-        )
-
     def plain(self) -> dict[str, Any]:
         """The configuration as numbers, strings and lists; a reward given as an object becomes its name."""
         if _is_plain(self.reward):

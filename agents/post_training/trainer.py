@@ -133,7 +133,7 @@ class PostTrainer:
         self.prior = deepcopy(base).eval()
         policy = DenoisingPolicy(self.prior, config.num_steps, chunk=config.optimizer.chunk, guidance=config.guidance)
         self.learner = Learner(
-            policy, config.resolved_reward(), config.algorithm, config.optimizer, config.regularisation,
+            policy, config.running(config.reward), config.algorithm, config.optimizer, config.regularisation,
             batch_size=config.batch_size, slots=config.slots, prompt=config.prompt, workers=config.workers,
             physics=config.physics, seed=config.seed,
         )  # fmt: skip

@@ -7,7 +7,7 @@ import logging
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict
 from typing import Any
 
@@ -132,7 +132,7 @@ class Pretrainer:
         self.logger.close()
         if self.processes.is_first:
             logger.info("measuring the residual error at 40 noise levels, for the samplers")
-        with self._averaged():
+        with averaged_weights(self.network, self.average):
             count = len(self.heldout_data)  # scenes of a union are sorted by type
             rows = torch.linspace(0, count - 1, min(_RESIDUAL, count)).long()
             self.prior.fit_residual(self.heldout_data[rows].to(self.device))
@@ -170,7 +170,7 @@ class Pretrainer:
             last = self.step == config.iterations
             row: dict[str, float] = {}
             if self.step % config.logger.evaluate_every == 0 or last:
-                with self._averaged():
+                with averaged_weights(self.network, self.average):
                     row["heldout"] = heldout_loss(self.prior, self.heldout_data.to(self.device))
             if self.step % config.logger.log_every == 0 or row:
                 row |= {"step": self.step, "loss": sum(running) / len(running), "gradient_norm": norm}
@@ -237,9 +237,6 @@ class Pretrainer:
             group["initial_lr"] = group["rate"]
         return LambdaLR(self.optimizer, lambda step: learning_rate_at(step, self.config), last_epoch=self.step - 1)
 
-    def _averaged(self) -> AbstractContextManager[nn.Module]:
-        return averaged_weights(self.network, self.average)
-
     def _save(self) -> None:
         if self.processes.is_first:
             state = {
@@ -290,7 +287,7 @@ class Pretrainer:
 
     def save_prior(self) -> ScenePrior:
         """Write the prior with averaged weights to ``output/prior``, and return it."""
-        with self._averaged():
+        with averaged_weights(self.network, self.average):
             self.prior.card = {
                 **self._origin,
                 "trained_steps": self.step,

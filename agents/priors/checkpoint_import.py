@@ -11,7 +11,6 @@ import os
 import pickle
 import re
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,6 +24,7 @@ from agents.priors.config import MixedPriorConfig
 from agents.priors.mixed import MixedPrior
 from scene_envs.datasets import DatasetInfo, read_metadata
 from scene_envs.errors import CorruptFileError, InvalidInputError, MissingDependencyError
+from scene_envs.files import page_values
 from scene_envs.normalizer import Normalizer
 from scene_envs.scene import POSE_FEATURES
 from scene_envs.scene_types import Camera, SceneType, get_scene_type, register_scene_type
@@ -150,8 +150,7 @@ def _reorder(tensors: dict[str, Tensor], order: Tensor) -> None:
             f"aliases: the categories of the file become {order.tolist()}; each asset of the scene type must have one "
             "model path, and each model path its own asset"
         )
-    rows = torch.empty_like(order)
-    rows[order] = torch.arange(len(order))
+    rows = order.argsort()
     tensors["category_in.weight"] = tensors["category_in.weight"][torch.cat([rows, torch.tensor([len(order)])])]
     for name in ("logits_out.1.weight", "logits_out.1.bias"):
         if name in tensors:
@@ -221,17 +220,9 @@ def _fill(network: torch.nn.Module, tensors: dict[str, Tensor], file: str | os.P
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
 
 
-@cache
-def _rules() -> dict[str, str]:
-    """Patterns of the tensor names in the authors' checkpoints, and the names in this package."""
-    import yaml
-
-    found: dict[str, str] = yaml.safe_load(Path(__file__).with_name("checkpoint_names.yaml").read_text("utf-8"))
-    return found
-
-
 def _our_name(name: str) -> str | None:
-    for pattern, replacement in _rules().items():
+    """The name in this package of a tensor in the authors' checkpoints; None for one of another model."""
+    for pattern, replacement in page_values("agents.priors", "checkpoint_names.yaml").items():
         ours, count = re.subn(f"^{pattern}", replacement, name)
         if count:
             return ours.replace("<x>", "scene").replace("<txt>", "text")

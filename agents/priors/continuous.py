@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import astuple
 from functools import cached_property
 
 import torch
@@ -313,12 +314,8 @@ def _code_normalizer(normalizer: Normalizer, rotation: str) -> Normalizer:
     else:
         low, high = -math.pi * turns, math.pi * turns
     middle = Normalizer.from_range(low, high)
-
-    def joined(name: str) -> Tensor:
-        own: Tensor = getattr(normalizer, name).cpu()
-        return torch.cat([own[TRANSLATION], getattr(middle, name), own[CATEGORY]])
-
-    return Normalizer(joined("scale"), joined("min"), joined("input_min"), joined("input_max"))
+    pairs = zip(astuple(normalizer), astuple(middle), strict=True)
+    return Normalizer(*(torch.cat([own.cpu()[TRANSLATION], new, own.cpu()[CATEGORY]]) for own, new in pairs))
 
 
 def _free_axes(normalizer: Normalizer) -> Tensor:

@@ -97,9 +97,7 @@ class MixedPrior(ScenePrior):
     def load_weights(self, tensors: dict[str, Tensor]) -> None:
         """Inverse of :meth:`weights`; raises RuntimeError when names or shapes differ."""
         text = {name.removeprefix(_TEXT): value for name, value in tensors.items() if name.startswith(_TEXT)}
-        self.denoiser.network.load_state_dict(
-            {name: value for name, value in tensors.items() if not name.startswith(_TEXT)}
-        )
+        super().load_weights({name: value for name, value in tensors.items() if not name.startswith(_TEXT)})
         if self.denoiser.text_encoder is not None:
             self.denoiser.text_encoder.load_state_dict(text)
 
@@ -208,8 +206,7 @@ class MixedPrior(ScenePrior):
         """
         if observed is not None or self.config.observed_share <= 0:
             return observed
-        fixed = torch.zeros(x.shape[:2], dtype=torch.bool, device=x.device)
-        fixed[:, : len(self.scene_type.fixed)] = True
+        fixed = ~self.frame(x).free.expand(x.shape[:2])
         return Observed(x, fixed, fixed)
 
     def initial_from_noise(self, noise: Tensor) -> Tensor:

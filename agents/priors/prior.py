@@ -78,13 +78,8 @@ class NoisedScenes:
 
     def rows(self, rows: slice) -> NoisedScenes:
         """Some of the scenes."""
-        named = ("x_t", "t", "target", "weight", "scale", "category")
-        return replace(
-            self,
-            **{name: getattr(self, name)[rows] for name in named},
-            drawn=None if self.drawn is None else self.drawn[rows],
-            observed=None if self.observed is None else self.observed.rows(rows),
-        )
+        some: dict[str, Any] = {name: value[rows] for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **some, observed=None if self.observed is None else self.observed.rows(rows))
 
 
 @dataclass(frozen=True)

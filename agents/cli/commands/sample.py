@@ -69,7 +69,7 @@ def run(settings: SampleConfig, run: Run) -> None:
     """Draw, score, save and picture the scenes."""
     from agents.evaluation.physics_figures import leaving_out
     from agents.priors.guidance import physics_strength
-    from rewards.process import close_reward, run_reward
+    from rewards.process import close_reward
     from scene_envs.envs.scoring import RewardScorer
     from scene_envs.export.formats import resolve_formats
     from scene_envs.physics import make_pool
@@ -77,13 +77,7 @@ def run(settings: SampleConfig, run: Run) -> None:
     formats = None if settings.export is None else resolve_formats(settings.export)
     reward = None
     if settings.reward is not None:
-        reward = run_reward(
-            settings.reward,
-            seed=settings.seed,
-            **vars(settings.reward_limits),
-            workers=settings.workers,
-            physics=settings.physics,
-        )
+        reward = settings.running(settings.reward)
         RewardScorer(reward, prompted=settings.prompt is not None)  # refuses one that needs prompts
     prior = load_prior(settings).with_union(settings.union)
     if not prior.scene_type.has_geometry:

@@ -41,7 +41,7 @@ def run(settings: SearchKeys, run: Run) -> None:
     """Search; the search writes its own metrics and pictures."""
     from agents.planning import run_search
     from agents.utils.interrupts import Terminated
-    from rewards.process import close_reward, is_foreign, run_reward
+    from rewards.process import close_reward, is_foreign
     from scene_envs.datasets import load_scenes
 
     search = SearchConfig(**{field.name: getattr(settings, field.name) for field in fields(SearchConfig)})
@@ -49,13 +49,7 @@ def run(settings: SearchKeys, run: Run) -> None:
     prior = settings.prior or ("dimsum_table" if scenes is None else scenes.scene_type.name)
     objective = settings.objective
     if is_foreign(objective):
-        objective = run_reward(
-            objective,
-            seed=settings.seed,
-            workers=settings.workers,
-            physics=settings.physics,
-            **vars(settings.reward_limits),
-        )
+        objective = settings.running(objective)
     with _search_progress(search.nfe_per_scene, settings.progress) as show:
         try:
             outcome = run_search(prior, objective, config=search, scenes=scenes, output=settings.output, progress=show)

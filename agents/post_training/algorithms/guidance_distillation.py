@@ -167,8 +167,7 @@ class GuidanceDistillation(AveragedSampler):
         x, text = states["scene"], text_of(states)
         denoised = self._teacher.distribution(x, step, text).denoised
         assert denoised is not None
-        movable = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
-        movable[:, : len(self.sampler.scene_type.fixed)] = False
+        movable = self.sampler.frame(x).free.expand(x.shape[:2])
         scenes = self.sampler.decode(denoised)
         guidance, std = PhysicsGuidance(self.settings.strength, movable), self._stds[step]
         moves = guidance(step, len(self.policy), lambda: scenes, std)
