@@ -41,7 +41,8 @@ class Guard:
         prompts: gives one prompt of each held-out scene; the loss is measured without prompts where it gives None.
         samples: settings for sampling and measuring; None measures the loss alone.
         limits: largest excess of each figure of samples over that of the base prior, by name; that of ``reward`` is
-            the largest fall of the mean reward below the best checkpoint's, in standard errors of their difference.
+            the largest fall of the mean reward below the best checkpoint's, in standard errors of their difference,
+            and is left out if the reward learns.
         target: largest ratio of a checkpoint that is kept, if the run holds the ratio.
         learns: whether the reward learns during the run.
 
@@ -65,8 +66,8 @@ class Guard:
         learns: bool = False,
     ) -> None:
         self.heldout, self.prompts, self.samples = heldout, prompts, samples
-        self.limit, self.target, self.limits = limit, target, dict(limits or {})
-        self.learns, self.seed = learns, seed
+        self.limit, self.target, self.learns, self.seed = limit, target, learns, seed
+        self.limits = {name: most for name, most in (limits or {}).items() if not (learns and name == "reward")}
         self.base_loss = float("nan")
         self.base_samples: dict[str, float] = {}
         self.last_samples: SceneBatch | None = None
@@ -136,11 +137,11 @@ class Guard:
 
     def _fell(self, figures: Mapping[str, float]) -> bool:
         """Whether the mean reward of samples is below the best checkpoint's by more than its limit, in standard errors
-        of their difference; False for NaN, and for a reward that learns, whose values cannot be compared.
+        of their difference; False for NaN.
         """
         error = math.hypot(self.best_error, figures["sample_reward_error"])
         fall = self.best_reward - figures["sample_reward"]
-        return not self.learns and fall > self.limits.get("reward", math.inf) * error
+        return fall > self.limits.get("reward", math.inf) * error
 
     @property
     def ratio(self) -> float:
@@ -154,7 +155,7 @@ class Guard:
 
     @property
     def over_limit_at(self) -> int | None:
-        """Iteration of the first check beyond a limit, from which the reward counts as over-optimised, or None."""
+        """Iteration of the first check beyond a limit, where the run has collapsed or is over-optimised; or None."""
         return next((r.iteration for r in self.readings if r.beyond), None)
 
     def summary(self) -> dict[str, Any]:

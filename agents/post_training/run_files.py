@@ -29,7 +29,7 @@ def draw_curve(
 ) -> Path:
     """Draw reward and guard over iterations as a PNG. ``history`` has ``iteration``, ``reward``, ``reward_std`` and, at
     checks, ``guard_ratio``, whose ``limit`` is a line; diamonds are rewards of the guard's samples. The picture is
-    shaded from iteration ``beyond`` (over-optimised); ``highest`` bounds the band of the standard deviation.
+    shaded from iteration ``beyond``, the first beyond a limit; ``highest`` bounds the band of the standard deviation.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -153,6 +153,7 @@ def test_the_report_shows_figures_beside_the_base_prior(tmp_path: Path) -> None:
     text = page({**guard, "over_optimised_from": None})
     head = "".join(f"<th>{name}</th>" for name in ("", "base prior", "kept prior", "last check", "limit"))
     assert head in text
+    assert re.search(r"<td>mean reward</td>(<td>[^<]+</td>){3}<td>kept − 5 standard errors of the difference<", text)
     assert re.search(r"<td>KL divergence of categories \(nats\)</td>(<td>[^<]+</td>){4}</tr>", text)
     assert "The guard found nothing beyond its limits." in text
     check = {"iteration": 5, "beyond": ("category_kl", "loss"), "samples": {}}
@@ -192,6 +193,7 @@ def test_a_mean_reward_below_the_best_checkpoints_is_beyond_its_limit(monkeypatc
         figures = ({"sample_reward": m, "sample_reward_error": e, "classifier_accuracy": 1 - m} for m, e in means)
         monkeypatch.setattr(guard, "_measure", lambda prior, sample: (1.0, next(figures)))
         guard.start(tiny_prior())
+        assert ("reward" in guard.summary()["sample_limits"]) is not learns
         return [guard.check(tiny_prior(), iteration, reward=0.0).beyond for iteration in (1, 2)]
 
     assert beyond_limits(1.99) == [(), ("reward",)]
