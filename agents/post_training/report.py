@@ -218,7 +218,7 @@ def measure_prior(
         **realism(raw),
         **({} if prompts is None else _mean("prompt_match", PromptMatch()(raw, context))),
     }
-    return Measured(figures, raw, ready and ready.batch, ready.ready if ready else None, left_out)
+    return Measured(figures, raw, ready.batch if ready else None, ready.ready if ready else None, left_out)
 
 
 def _counted(name: str, batch: SceneBatch, counts: Tensor, valid: Tensor) -> dict[str, float]:
