@@ -8,12 +8,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from trimesh.exchange.obj import export_obj
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from scene_envs.arrays import Array
@@ -418,17 +419,15 @@ def _write_parts(parts: Sequence[ConvexPart], folder: Path, prefix: str) -> list
 
 
 def _write_visual(mesh: trimesh.Trimesh, path: Path) -> Path:
-    """The mesh with its image as Wavefront files: most loaders read textures, and few read colours of vertices. The
-    numbers are written here, in the layout of trimesh, which takes several times as long.
-    """
-    visual, white, name = cast(Any, mesh.visual), [255, 255, 255, 255], path.name
-    material = SimpleMaterial(visual.material.baseColorTexture, white, white, [0, 0, 0, 255], name=name)
-    text = f"mtllib {name}.mtl\nusemtl {name}"
-    for word, rows in (("v", mesh.vertices), ("vn", mesh.copy().vertex_normals), ("vt", visual.uv)):
-        text += (f"\n{word}" + " %.7f" * rows.shape[1]) * len(rows) % tuple(rows.ravel().tolist())
-    text += "\nf %d/%d/%d %d/%d/%d %d/%d/%d" * len(mesh.faces) % tuple(np.repeat(mesh.faces + 1, 3).tolist())
-    for file, data in {**material.to_obj()[0], f"{name}.obj": f"{text}\n\n".encode()}.items():
-        path.with_name(file).write_bytes(data)
+    """The mesh with its image: most loaders read textures, and few read colours of vertices."""
+    shown, white = mesh.copy(), [255, 255, 255, 255]
+    visual: Any = shown.visual
+    material = SimpleMaterial(visual.material.baseColorTexture, white, white, [0, 0, 0, 255], name=path.name)
+    shown.visual = trimesh.visual.TextureVisuals(visual.uv, material)
+    mtl = f"{path.name}.mtl"
+    text, others = export_obj(shown, include_normals=True, return_texture=True, mtl_name=mtl, header=None, digits=7)
+    for name, data in {**others, f"{path.name}.obj": text.encode()}.items():
+        path.with_name(name).write_bytes(data)
     return path.with_suffix(".obj")
 
 
