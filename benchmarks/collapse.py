@@ -25,7 +25,7 @@ from scene_envs import SceneBatch
 from scene_envs.render import render
 
 PRIOR = "dimsum_table"
-PUBLISHED = {"algorithm.expectation_lr": 0.0}
+PUBLISHED = {"algorithm.expectation_lr": 0.0, "algorithm.sampler_decay": 0.9}
 RUNS: dict[str, tuple[str, dict[str, Any]]] = {
     "published": ("as published", PUBLISHED),
     "rollback": (

@@ -136,7 +136,7 @@ class ForwardProcessSettings(AlgorithmSettings):
     draws: Count = 2
     credit: Annotated[str, OneOf(CREDITS)] = "auto"
     category_credit: Annotated[str, OneOf(("auto", "scene", "none"))] = "auto"
-    sampler_decay: Annotated[float, BELOW_ONE] = 0.9
+    sampler_decay: Annotated[float, BELOW_ONE] = 0.99
     advantage_clip: Unlimited = 2.0
     expectation_lr: Annotated[float, at_least(0)] = 3e-4
 
