@@ -1,9 +1,10 @@
 """A run that collapses, and what the guard makes of it: NFT as published (`algorithm.expectation_lr=0`), the same with
-`guard.action=rollback`, and NFT at its defaults, toward `feasible_share` on `dimsum_table`.
+`guard.action=rollback`, NFT at its defaults, and the same with a shorter average of the weights that sample, toward
+`feasible_share` on `dimsum_table`.
 
     python -m benchmarks.collapse runs/collapse --iterations 1000
 
-It trains the three runs, resumes those that are there, keeps samples of the published run at four moments, and draws
+It trains the four runs, resumes those that are there, keeps samples of the published run at four moments, and draws
 `collapse.png` and `collapse.csv`.
 """
 
@@ -33,6 +34,7 @@ RUNS: dict[str, tuple[str, dict[str, Any]]] = {
         PUBLISHED | {"guard.action": "rollback", "guard.samples_every": 10},
     ),
     "defaults": ("defaults", {}),
+    "short_average": ("defaults, algorithm.sampler_decay=0.9", {"algorithm.sampler_decay": 0.9}),
 }
 MOMENTS = (0, 20, 50, 120)
 """Iterations of the published run whose samples are shown."""
@@ -50,7 +52,7 @@ CURVES = {"reward": "feasible share, mean of five batches", "guard_ratio": "held
           "guard_classifier_accuracy": "accuracy of the guard's classifier"}  # fmt: skip
 _BATCHES = 5
 """Batches over which the curve of the reward is averaged."""
-COLORS = {"published": "#c44e52", "rollback": "#dd8452", "defaults": "#4c72b0"}
+COLORS = {"published": "#c44e52", "rollback": "#dd8452", "defaults": "#4c72b0", "short_average": "#8c8c8c"}
 
 
 def train(folder: Path, name: str, iterations: int) -> None:
@@ -87,7 +89,8 @@ def draw(folder: Path, path: Path) -> None:
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.15, 1))
     for axes, (key, label) in zip(upper.subplots(1, len(CURVES)), CURVES.items(), strict=True):
         for name, (title, _) in RUNS.items():
-            rows = [row for row in read(folder, name) if key in row]
+            if not (rows := [row for row in read(folder, name) if key in row]):
+                continue
             iterations, values = np.array([(row["iteration"], row[key]) for row in rows]).T
             if key == "reward":
                 values = np.convolve(values, np.full(_BATCHES, 1 / _BATCHES), mode="valid")

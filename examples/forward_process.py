@@ -82,7 +82,7 @@ class Args:
     """strength; smaller ones step further from the sampler"""
     advantage_clip: float = 2.0
     """advantage at which an object is fully good or bad"""
-    sampler_decay: float = 0.9
+    sampler_decay: float = 0.99
     """of the average that is the sampler"""
     regularization: float = 0.2
     """coefficient of the pretraining loss on real scenes"""

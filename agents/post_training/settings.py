@@ -116,7 +116,8 @@ class ForwardProcessSettings(AlgorithmSettings):
         category_credit: credit of categories: ``scene`` uses the advantage of the scene, ``none`` keeps the categories
             as they are, ``auto`` is ``none`` if poses have credit per object and the reward counts no objects, else
             ``scene``.
-        sampler_decay: final decay of the averaged weights that sample, per iteration; it rises from 0.
+        sampler_decay: largest decay of the averaged weights that sample, per iteration; after k iterations it is at
+            most k / (k + 10).
         advantage_clip: advantage, in standard deviations, at which a sample is fully good or bad.
         expectation_lr: learning rate of the copy of the denoiser that learns the mean of own samples; 0 takes the
             sampling policy for it.
