@@ -24,6 +24,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:  # its workers have the same folder
 if "SCENE_ENVS_TEST_DEVICE" not in os.environ:
     os.environ["CUDA_VISIBLE_DEVICES"] = ""  # numbers of tests are those of a CPU; `make test-gpu` compares
 gc.disable()  # what collection imports is kept: the search of it for garbage costs seconds
+os.register_at_fork(after_in_child=gc.freeze)  # a copy has no threads, for which a freed stage of USD waits forever
 
 
 def _registries() -> list[dict[str, Any]]:
@@ -104,6 +105,18 @@ def pytest_collect_file(file_path: Path) -> Generator[None, list[pytest.Collecto
     if file_path.is_relative_to(_TESTS) and ">>>" not in file_path.read_text(encoding="utf-8", errors="replace"):
         return [collector for collector in found if type(collector) is pytest.Module]
     return found
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of folders of one name follow each other, in whatever order of folders, files and tests was drawn.
+
+    One process of two then imports what they need and builds their assets, and not both.
+    """
+    folders: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        folders.setdefault(item.path.parent.name, []).append(item)
+    items[:] = [item for folder in folders.values() for item in folder]
 
 
 @pytest.hookimpl(trylast=True)
