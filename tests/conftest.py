@@ -18,6 +18,7 @@ def pytest_collection_finish() -> None:
     """What takes seconds and is the same in many tests is made once per process."""
     _ranges_once()
     _wavefronts_once()
+    _hulls_once()
 
 
 def _wavefronts_once() -> None:
@@ -37,6 +38,24 @@ def _wavefronts_once() -> None:
         return text, dict(others)
 
     placed.export_obj = once
+
+
+def _hulls_once() -> None:
+    """Inset hulls of convex parts, each from a linear program; processes that begin as copies know them as well."""
+    parts = sys.modules.get("scene_envs.physics.parts")
+    if parts is None:  # nothing that was collected simulates
+        return
+    inset, known = parts.inset_hull, {}
+
+    def once(part: Any, distance: float) -> Any:
+        key = (distance, part.normals.tobytes(), part.offsets.tobytes(), part.vertices.tobytes())
+        if key not in known:
+            known[key] = inset(part, distance)
+        return known[key].copy()
+
+    for name in ("parts", "bullet"):
+        if module := sys.modules.get(f"scene_envs.physics.{name}"):
+            module.inset_hull = once  # type: ignore[attr-defined]
 
 
 def _ranges_once() -> None:
