@@ -108,18 +108,6 @@ def pytest_collect_file(file_path: Path) -> Generator[None, list[pytest.Collecto
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests of folders of one name follow each other, in whatever order of folders, files and tests was drawn.
-
-    One process of two then imports what they need and builds their assets, and not both.
-    """
-    folders: dict[str, list[pytest.Item]] = {}
-    for item in items:
-        folders.setdefault(item.path.parent.name, []).append(item)
-    items[:] = [item for folder in folders.values() for item in folder]
-
-
-@pytest.hookimpl(trylast=True)
 def pytest_collection_finish() -> None:
     gc.freeze()  # no later search visits it either
     gc.set_threshold(20_000, 10, 10)  # searches after every 700 objects are a sixth of the tests' time
