@@ -24,6 +24,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:  # its workers have the same folder
 if "SCENE_ENVS_TEST_DEVICE" not in os.environ:
     os.environ["CUDA_VISIBLE_DEVICES"] = ""  # numbers of tests are those of a CPU; `make test-gpu` compares
 gc.disable()  # what collection imports is kept: the search of it for garbage costs seconds
+os.register_at_fork(after_in_child=gc.freeze)  # a copy has no threads, for which a freed stage of USD waits forever
 
 
 def _registries() -> list[dict[str, Any]]:

@@ -15,7 +15,51 @@ from PIL import Image
 
 
 def pytest_collection_finish() -> None:
-    """The ranges of a built-in grammar are measured once per process, on fewer objects: that takes seconds."""
+    """What takes seconds and is the same in many tests is made once per process."""
+    _ranges_once()
+    _wavefronts_once()
+    _hulls_once()
+
+
+def _wavefronts_once() -> None:
+    """Text and texture of a drawn mesh, which trimesh writes."""
+    placed = sys.modules.get("scene_envs.export.placed")
+    if placed is None:  # nothing that was collected exports
+        return
+    write, known = placed.export_obj, {}
+
+    def once(mesh: Any, **options: Any) -> Any:
+        look, arrays = mesh.visual, (mesh.vertices, mesh.faces, mesh.vertex_normals, mesh.visual.uv)
+        picture = look.material.image
+        key = (look.material.name, repr(options), picture.size, picture.tobytes(), *(a.tobytes() for a in arrays))
+        if key not in known:
+            known[key] = write(mesh, **options)
+        text, others = known[key]
+        return text, dict(others)
+
+    placed.export_obj = once
+
+
+def _hulls_once() -> None:
+    """Inset hulls of convex parts, each from a linear program; processes that begin as copies know them as well."""
+    parts = sys.modules.get("scene_envs.physics.parts")
+    if parts is None:  # nothing that was collected simulates
+        return
+    inset, known = parts.inset_hull, {}
+
+    def once(part: Any, distance: float) -> Any:
+        key = (distance, part.normals.tobytes(), part.offsets.tobytes(), part.vertices.tobytes())
+        if key not in known:
+            known[key] = inset(part, distance)
+        return known[key].copy()
+
+    for name in ("parts", "bullet"):
+        if module := sys.modules.get(f"scene_envs.physics.{name}"):
+            module.inset_hull = once  # type: ignore[attr-defined]
+
+
+def _ranges_once() -> None:
+    """The ranges of a built-in grammar, on fewer objects."""
     ranges = sys.modules.get("scene_envs.datasets.generation")
     if ranges is None:  # nothing that was collected generates
         return
@@ -31,6 +75,7 @@ def pytest_collection_finish() -> None:
         if grammar.name not in known:
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(ranges, "_OBJECTS", 300)
+                patch.setattr(ranges, "_STEP", 32)
                 known[grammar.name] = measure(grammar)
         low, high, tilted = known[grammar.name]
         return low.clone(), high.clone(), tilted

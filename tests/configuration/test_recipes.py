@@ -16,7 +16,8 @@ from scene_envs.normalizer import Normalizer
 
 
 @pytest.mark.slow
-def test_the_paper_s_recipe_is_its_setting() -> None:
+def test_the_paper_s_recipe_is_its_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.nn.Linear, "reset_parameters", lambda self: None)  # nobody draws 88 million numbers
     config = compose("pretrain", PretrainConfig, ["recipe=paper", "text=vocabulary"])
     raw = torch.from_numpy(get_grammar("dimsum_table").sample_array(np.random.default_rng(0), 40))
     prior = build_prior(config, raw, Normalizer.fit(raw), [["A scene with 8 objects."]])

@@ -13,9 +13,6 @@ from typing import Any
 
 import pytest
 
-from rewards import IsolatedReward, allow_local_rewards, evaluate_reward
-from scene_envs import SceneBatch
-from scene_envs.datasets import generate
 from scene_envs.errors import InvalidInputError, PhysicsError
 from scene_envs.workers import Process, Task, WorkerFailure, WorkerPool, run_apart
 
@@ -196,29 +193,6 @@ def test_a_worker_ends_with_its_parent_even_while_it_works() -> None:
     while is_running(worker):
         assert time.monotonic() < deadline
         time.sleep(0.01)
-
-
-@pytest.fixture
-def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with files named like modules; the file that is there once one of them was imported."""
-    sprung = tmp_path / "sprung"
-    for name in ("scene_envs", "rewards", "numpy", "torch", "runpy", "signal"):
-        (tmp_path / f"{name}.py").write_text(f"open({str(sprung)!r}, 'w')\nraise SystemExit('trap')\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
-    return sprung
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("new_interpreters")
-def test_workers_import_nothing_from_the_current_folder(trap: Path, tmp_path: Path) -> None:
-    """Those of rewards, and those of generation, which simulate and start as all others do."""
-    (tmp_path / "mine.py").write_text("def few(batch):\n    return -batch.counts\n")
-    allow_local_rewards("mine.py")
-    with IsolatedReward("./mine.py:few") as reward:
-        assert evaluate_reward(reward, SceneBatch.empty("dimsum_table", 2)).is_valid.all()
-    generate("dimsum_table", 2, tmp_path / "data", workers=1, shard_size=1, progress=False)
-    assert not trap.exists()
 
 
 def test_a_script_is_imported_for_what_it_defines_and_must_have_a_guard(tmp_path: Path) -> None:

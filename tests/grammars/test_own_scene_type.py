@@ -27,6 +27,7 @@ from scene_envs.grammars import get_grammar, list_grammars
 from scene_envs.physics import PhysicsPool, feasibility, make_ready
 from scene_envs.render import observe, render, write_viewer
 from tests.helpers.outside_package import installed
+from tests.helpers.trap import trapped
 
 DOCS = Path(__file__).parents[2] / "docs" / "grammars.md"
 pytestmark = pytest.mark.slow
@@ -45,14 +46,15 @@ def _ranges_of_few_objects() -> Iterator[None]:
     """Ranges come from few objects, as those of built-in grammars in ``tests/conftest.py``."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("scene_envs.datasets.generation._OBJECTS", 200)
+        patch.setattr("scene_envs.datasets.generation._STEP", 32)
         yield
 
 
 @pytest.fixture(scope="module")
 def folder(tea_house: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of four scenes, made by a spawned process that finds the package by itself."""
+    """A dataset of four scenes, made by a new interpreter that finds the package, and nothing in the current folder."""
     output = tmp_path_factory.mktemp("data") / NAME
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, trapped(tmp_path_factory.mktemp("current")):
         patch.setattr("scene_envs.workers.subprocess", subprocess)
         report = generate(NAME, 4, output, seed=3, workers=1, shard_size=2, progress=False)
     assert report.scenes == 4

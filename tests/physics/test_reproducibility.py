@@ -25,7 +25,8 @@ COMPOSED = ("feasibility", "make_ready")
 """What the other types are asked of a scene each: `make_ready` projects and settles."""
 SLOTS = 10
 """How many slots of the scenes of other types are filled."""
-NAMES = [scene_type.name for scene_type in BUILT_IN]
+NAMES = list({scene_type.assets: scene_type.name for scene_type in BUILT_IN}.values())
+"""One type for each set of assets."""
 
 
 @pytest.fixture(scope="module")

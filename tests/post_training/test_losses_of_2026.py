@@ -182,7 +182,7 @@ class TestGARDO:
             "gardo": {"name": "gardo", "penalty": 0.0, "diversity": 0.0},
         }
         weights = [
-            torch.cat([p.flatten() for p in run_of(tmp_path / name, prior, keys).prior.parameters()])
+            torch.cat([p.flatten() for p in run_of(tmp_path / name, prior, keys, iterations=2).prior.parameters()])
             for name, keys in runs.items()
         ]
         assert torch.equal(*weights)
@@ -242,10 +242,17 @@ def run_of(output: Path, prior: ScenePrior, algorithm: dict[str, Any], **changes
 
 
 @pytest.mark.parametrize("name", ["udm_grpo", "crd", "gardo"])
-@pytest.mark.parametrize("process", ["mixed", "continuous"])
-def test_a_run_moves_the_prior_and_resumes_exactly(name: str, process: str, tmp_path: Path) -> None:
+def test_a_run_moves_a_continuous_prior(name: str, tmp_path: Path) -> None:
     load_example(name)
-    prior = tiny_prior("dimsum_table", process=process)
+    prior = tiny_prior("dimsum_table", process="continuous")
+    run = run_of(tmp_path, prior, {"name": name}, iterations=1)
+    assert any(not torch.equal(run.prior.state_dict()[key], value) for key, value in prior.state_dict().items())
+
+
+@pytest.mark.parametrize("name", ["udm_grpo", "crd", "gardo"])
+def test_a_run_moves_a_mixed_prior_and_resumes_exactly(name: str, tmp_path: Path) -> None:
+    load_example(name)
+    prior = tiny_prior("dimsum_table", process="mixed")
     whole = run_of(tmp_path / "whole", prior, {"name": name}, iterations=2)
     half = tmp_path / "half"
     run_of(half, prior, {"name": name}, iterations=1)

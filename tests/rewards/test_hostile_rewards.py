@@ -24,6 +24,7 @@ from rewards import (
 from rewards.process import SeededReward, is_foreign, run_reward
 from scene_envs.errors import InvalidInputError, RewardError, RewardTimeoutError
 from tests.helpers import hostile_rewards as hostile
+from tests.helpers.trap import trapped
 
 FILE = Path(hostile.__file__)
 
@@ -152,16 +153,19 @@ def test_limits_are_positive_numbers(limits):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("new_interpreters")
-def test_scores_of_a_worker_are_those_of_this_process_bit_for_bit_and_its_end_prints_no_traceback(cups, capfd):
-    allow_local_rewards(FILE)
-    with IsolatedReward(f"{FILE}:named", timeout=60, seed=5) as reward:
-        for name in ("honest", "noisy"):
-            context = RewardContext(prompts=(name, name))
-            here = evaluate_reward(SeededReward(hostile.named, 5), cups, context)
-            there = [evaluate_reward(reward, cups, context) for _ in range(2)]
-            assert torch.equal(here.value, there[0].value)
-            assert torch.equal(here.value, there[1].value)
-        output = evaluate_reward(reward, cups, RewardContext(prompts=("closes_pipes", "closes_pipes")))
+def test_scores_of_a_new_interpreter_are_those_of_this_process_bit_for_bit(cups, capfd, tmp_path):
+    """It imports nothing else from the current folder, where the reward's file is, and its end prints no traceback."""
+    shutil.copy(FILE, tmp_path / "mine.py")
+    with trapped(tmp_path):
+        allow_local_rewards("mine.py")
+        with IsolatedReward("./mine.py:named", timeout=60, seed=5) as reward:
+            for name in ("honest", "noisy"):
+                context = RewardContext(prompts=(name, name))
+                here = evaluate_reward(SeededReward(hostile.named, 5), cups, context)
+                there = [evaluate_reward(reward, cups, context) for _ in range(2)]
+                assert torch.equal(here.value, there[0].value)
+                assert torch.equal(here.value, there[1].value)
+            output = evaluate_reward(reward, cups, RewardContext(prompts=("closes_pipes", "closes_pipes")))
     assert output.valid.tolist() == [False, False]
     assert "Traceback" not in capfd.readouterr().err
 
@@ -180,8 +184,8 @@ def worker():
     [
         ("leaves", "called sys.exit"),
         ("quits", r"ended its process \(exit status 0\)"),
-        ("hangs", "took longer than reward_limits.timeout=1 s"),
-        ("holds_the_interpreter", "took longer than reward_limits.timeout=1 s"),
+        ("hangs", "took longer than reward_limits.timeout=0.3 s"),
+        ("holds_the_interpreter", "took longer than reward_limits.timeout=0.3 s"),
         ("segfaults", r"crashed its process \(SIGSEGV\)"),
         ("fills_memory", "memory"),
         ("talks", "1048576 characters"),
@@ -196,7 +200,7 @@ def test_a_hostile_reward_costs_its_scenes_and_nothing_else(name, message, cups,
     before = cups.tensor.clone()
     worker.settings = replace(worker.settings, timeout=20)  # in which the one before may have to be replaced
     assert evaluate_reward(worker, cups, RewardContext(prompts=("honest", "honest"))).valid.tolist() == [True, True]
-    worker.settings = replace(worker.settings, timeout=1 if "longer" in message else 20)
+    worker.settings = replace(worker.settings, timeout=0.3 if "longer" in message else 20)
     started = time.monotonic()
     output = evaluate_reward(worker, cups, RewardContext(prompts=(name, name)))
     assert time.monotonic() - started < 30  # the limit, and the end of the process

@@ -629,13 +629,11 @@ def painted(mesh: trimesh.Trimesh, color: Color | None) -> trimesh.Trimesh:
     colors = _corner_colors(mesh) if color is None or has_color(mesh) else None
     if colors is None:
         colors = np.tile(np.array(color or _GREY, dtype=np.uint8), (len(faces), 3, 1))
-    normals = _corner_normals(mesh)
     corners = np.asarray(mesh.vertices)[faces].reshape(-1, 3)
+    _, point = _different_rows(corners)
+    normals = _corner_normals(mesh, point)
     rows = np.column_stack([np.round(normals.reshape(-1, 3) * 1e4), colors.reshape(-1, 3)]).astype(np.int64)
-    _, point = np.unique(corners, axis=0, return_inverse=True)
-    _, first, index = np.unique(
-        np.column_stack([point.reshape(-1), rows]), axis=0, return_index=True, return_inverse=True
-    )
+    first, index = _different_rows(np.column_stack([point, rows]))
     rgba = np.column_stack([colors.reshape(-1, 3)[first], np.full(len(first), 255, dtype=np.uint8)])
     return trimesh.Trimesh(
         vertices=corners[first],
@@ -644,6 +642,18 @@ def painted(mesh: trimesh.Trimesh, color: Color | None) -> trimesh.Trimesh:
         vertex_colors=rgba,
         process=False,
     )
+
+
+def _different_rows(rows: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Where each different row of (n, k) stands first, in their order, and which of them each of the n is.
+
+    As ``numpy.unique`` of an axis, in a quarter of its time.
+    """
+    order = np.lexsort(rows.T[::-1])
+    is_new = np.append(True, (rows[order[1:]] != rows[order[:-1]]).any(axis=1))[: len(rows)]
+    index = np.empty(len(rows), dtype=np.int64)
+    index[order] = np.cumsum(is_new) - 1
+    return order[is_new], index
 
 
 def _corner_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8] | None:
@@ -692,8 +702,10 @@ def _cut(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, visual=look, process=False)
 
 
-def _corner_normals(mesh: trimesh.Trimesh) -> Array:
-    """(F, 3, 3): at each corner the normal of the faces around it that meet at less than 40 degrees."""
+def _corner_normals(mesh: trimesh.Trimesh, point: NDArray[np.int64]) -> Array:
+    """(F, 3, 3): at each corner, of the points (3 F,), the normal of the faces around it that meet at less than 40
+    degrees.
+    """
     faces = np.asarray(mesh.faces)
     triangles = np.asarray(mesh.vertices)[faces]
     area = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])  # (F, 3)
@@ -702,8 +714,6 @@ def _corner_normals(mesh: trimesh.Trimesh) -> Array:
     flat = np.repeat(unit[:, None], 3, axis=1)
     if len(faces) > _MAX_SMOOTHED:
         return flat
-    _, point = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
-    point = point.reshape(-1)
     order = np.argsort(point, kind="stable")
     starts = np.searchsorted(point[order], np.arange(point.max() + 1))
     sizes = np.diff(np.append(starts, len(order)))
