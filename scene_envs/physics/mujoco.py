@@ -51,6 +51,8 @@ the depth: the true depth is between the two."""
 _ARENA, _ROOMS = 1 << 19, (1, 16)
 """Bytes for the contacts of each body of a model, at least for eight; where they do not suffice, the work is done again
 with a model of more room."""
+_CONTACTS = 20
+"""Contacts whose step costs at least as much as that of a free object, one unit of work."""
 _PAIRS = 512
 """Pairs of parts that MuJoCo measures together."""
 _CONTACT_BYTES, _SEARCH_BYTES = 1 << 10, 1 << 23
@@ -194,7 +196,7 @@ class _Stage:
         for done in range(0, steps, LOOK):
             ahead = min(LOOK, steps - done)
             mujoco.mj_step(model, data, ahead)
-            course.budget.spent += ahead * count
+            course.budget.spent += ahead * max(count, data.ncon / _CONTACTS)
             if course.budget.is_spent or self.is_full or (np.abs(velocity) < limits).all():
                 break
             if course.settling is not None:

@@ -35,8 +35,8 @@ _LEAN = 0.12
 another."""
 _STAYS: dict[str, Any] = {"max_displacement": 1e-3, "max_rotation": 1e-2}
 _HOLDS: dict[str, Any] = {"max_displacement": 2e-3, "max_rotation": 2e-2, "duration": 0.5}
-_LASTING: tuple[dict[str, Any], ...] = ({"duration": 2.0} | _STAYS, {"duration": 2.0} | _STAYS)
-"""The longest trials: time (s) and limits of motion (m, rad). The second is made where the first removed an object."""
+_LASTING: dict[str, Any] = {"duration": 2.0} | _STAYS
+"""The longest trial: time (s) and limits of motion (m, rad). At the end it is repeated until it removes no object."""
 _UPRIGHT: tuple[dict[str, Any], ...] = ({"duration": 0.1} | _STAYS, {"duration": 0.5} | _STAYS)
 """The shorter trials, made first in every round: they find most of the objects that move, at less cost."""
 _LEANING: tuple[dict[str, Any], ...] = tuple(
@@ -186,7 +186,7 @@ def _judge_round(batch: SceneBatch, units: Tensor, pool: PhysicsPool) -> tuple[T
     ready = _strike(batch, candidates & (units > 0)[:, None], _UPRIGHT, units, pool)
     complete = ((ready == candidates).all(dim=-1) & (units > 0)).nonzero()[:, 0]
     lasting = torch.zeros(len(batch), dtype=torch.bool)
-    for trials in (_LEANING, _LASTING[:1]):
+    for trials in (_LEANING, (_LASTING,)):
         left = units[complete]
         stays = _strike(batch[complete], ready[complete], trials, left, pool)
         unmoved = (stays == ready[complete]).all(dim=-1)
@@ -208,20 +208,16 @@ def _strike(
 
 
 def _strike_until_still(batch: SceneBatch, ready: Tensor, units: Tensor, pool: PhysicsPool) -> Tensor:
-    """``ready`` (B, N) without the objects that move in the longest trial, which is repeated where it removed objects.
-    If it removes objects again, all that moved in it by ``_UNMOVED`` or more are removed.
+    """``ready`` (B, N) without the objects that move in the longest trial, which is repeated where it removed objects,
+    until it removes none. Repetitions that remove objects remove all that moved in them by ``_UNMOVED`` or more.
     """
     ready = ready.clone()
-    scenes = ready.any(dim=-1).nonzero()[:, 0]
-    still = ready[scenes]
-    for trial in _LASTING:
-        if not len(scenes):
-            break
-        feasible, displacement = _judge(batch[scenes].keeping(ready[scenes]), scenes, trial, units, pool)
+    scenes, repeated = ready.any(dim=-1).nonzero()[:, 0], False
+    while len(scenes):
+        feasible, displacement = _judge(batch[scenes].keeping(ready[scenes]), scenes, _LASTING, units, pool)
         struck = (ready[scenes] & ~feasible).any(dim=-1)
-        ready[scenes] &= feasible
-        scenes, still = scenes[struck], (displacement < _UNMOVED)[struck]
-    ready[scenes] &= still
+        ready[scenes] &= feasible & ((displacement < _UNMOVED) | ~struck[:, None] | (not repeated))
+        scenes, repeated = scenes[struck & ready[scenes].any(dim=-1)], True
     return ready
 
 

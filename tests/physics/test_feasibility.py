@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from agents.evaluation.physics_figures import ready_figures
 from scene_envs.errors import InvalidInputError
@@ -22,6 +23,7 @@ from scene_envs.physics import (
     make_ready,
     penetration,
     project,
+    readiness,
     settle,
 )
 from scene_envs.physics.motion import physics_of
@@ -179,6 +181,21 @@ def test_what_has_no_support_is_not_ready() -> None:
     assert result.ready[0, 1:3].tolist() == [True, False]
     assert result.counts.tolist() == [1]
     assert float(result.batch.translations[0, 2, 2]) < -0.02
+
+
+def test_what_leaned_on_objects_that_are_not_ready_is_not_ready(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of five objects falls when the one before it is removed, and the first one falls by itself."""
+    batch, trials = scene(*[("cube", 0.2 * index, 0.0, 0.0) for index in range(5)]), []
+
+    def judge(kept: SceneBatch, *_: Any) -> tuple[Tensor, Tensor]:
+        stands = kept.is_free & kept.is_free.roll(1, dims=1)
+        trials.append(int(kept.is_free.sum()))
+        return stands, (~stands).float()
+
+    monkeypatch.setattr(readiness, "_judge", judge)
+    ready = readiness._strike_until_still(batch, batch.is_free, torch.ones(1), PhysicsPool(0))
+    assert not bool(ready.any())
+    assert trials == [5, 4, 3, 2, 1]
 
 
 @pytest.mark.slow
