@@ -197,7 +197,8 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
             check_option(folder := key.removeprefix("+"), value, group_options(folder, config_dir))
             choices[key] = value
         elif head not in fields:
-            raise unknown_name(f"{command} key", key, dotted_values(config()))
+            others = [_ADAPTER.name] if "prior" in fields else []
+            raise unknown_name(f"{command} key", key, [*others, *dotted_values(config())])
         elif _is_option(fields[head], key, value, config_dir):
             choices[key] = value
             values.pop(key, None)

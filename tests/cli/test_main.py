@@ -81,6 +81,7 @@ def test_help_loads_nothing_heavy():
     [
         (["smaple"], "unknown command 'smaple'; did you mean 'sample'?"),
         (["sample", "cuont=3"], "unknown sample key 'cuont'; did you mean 'count'?"),
+        (["evaluate", "adaptor=runs/a"], "unknown evaluate key 'adaptor'; did you mean 'adapter'?"),
         (["pretrain", "lr=1"], "unknown pretrain key 'lr'; did you mean 'optimizer.lr'?"),
         (["sample", "count"], "expected key=value, got 'count'"),
         (["sample", "count=three"], "count=three is not a whole number"),
