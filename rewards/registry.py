@@ -118,7 +118,7 @@ def allowed_files() -> list[Path]:
 
 def load_local(reward: str) -> Callable[..., Any]:
     """The function or class that ``PATH.py:NAME`` names; runs the file once per process. Raises InvalidInputError where
-    the file was not allowed, does not exist or has no such callable, and RewardError where it cannot be run.
+    the file was not allowed, does not exist, cannot be run or has no such callable.
     """
     match = _LOCAL.fullmatch(reward)
     assert match is not None
@@ -133,7 +133,7 @@ def load_local(reward: str) -> Callable[..., Any]:
     try:
         found = getattr(run_file(path), match["name"], None)
     except PluginError as error:
-        raise RewardError(f"reward {reward!r}: {error}") from error
+        raise InvalidInputError(f"reward {reward!r}: {error}") from error
     if not callable(found):
         raise InvalidInputError(f"reward {reward!r}: {str(path)!r} has no function or class {match['name']!r}")
     return found  # type: ignore[no-any-return]

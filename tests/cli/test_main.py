@@ -107,6 +107,15 @@ def test_wrong_input_exits_2_with_one_paragraph(words, message, tmp_path, capsys
     assert len(err.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [["check-reward", "reward"], ["search", "mask"], ["post-train", "algorithm"]])
+def test_a_file_that_raises_when_it_is_imported_exits_2(words, tmp_path, capsys):
+    (file := tmp_path / "mine.py").write_text("raise ValueError('no table')\n")
+    outputs = [] if words[0] == "check-reward" else [f"output={tmp_path / 'out'}"]
+    assert main([words[0], f"{words[1]}={file}:mine", "--allow-local", *outputs]) == 2
+    assert capsys.readouterr().err.strip().endswith("cannot be run: ValueError: no table")
+
+
 def test_an_output_that_is_a_file_exits_2(tmp_path, capsys):
     (tmp_path / "taken").write_text("")
     assert main(["sample", f"output={tmp_path / 'taken'}"]) == 2

@@ -233,15 +233,16 @@ def test_a_file_that_draws_when_it_is_imported_gives_the_same_in_every_process(c
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("line", "message"),
-    [("import sys; sys.exit(0)", "SystemExit"), ("import os; os._exit(0)", "ended its process"),
-     ("import time; time.sleep(1e6)", "took longer than reward_limits.timeout=4 s")],
+    ("line", "error", "message"),
+    [("import sys; sys.exit(0)", InvalidInputError, "SystemExit"),
+     ("import os; os._exit(0)", RewardError, "ended its process"),
+     ("import time; time.sleep(1e6)", RewardError, "took longer than reward_limits.timeout=4 s")],
 )  # fmt: skip
-def test_a_file_that_exits_or_hangs_when_it_is_imported_is_one_sentence(line, message, tmp_path):
+def test_a_file_that_exits_or_hangs_when_it_is_imported_is_one_sentence(line, error, message, tmp_path):
     path = tmp_path / "mine.py"
     path.write_text(f"{line}\ndef few(batch):\n    return -batch.counts\n")
     allow_local_rewards(path)
-    with pytest.raises(RewardError, match=message):
+    with pytest.raises(error, match=message):
         IsolatedReward(f"{path}:few", timeout=4)
 
 
