@@ -27,6 +27,7 @@ from agents.configuration.composition import (
     named_options,
     parse_config,
     verbatim,
+    with_implied,
 )
 from agents.configuration.prior_names import adapted_name
 from scene_envs.errors import CorruptFileError, InvalidInputError, unknown_name
@@ -99,7 +100,8 @@ def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "
     paragraphs = []
     for owner, keys in sections:
         if not isinstance(owner, type):
-            heading = _heading(owner, chosen.get(owner.name, ""), config_dir)
+            name = getattr(getattr(config, owner.name, None), "name", "")
+            heading = _heading(owner, chosen.get(owner.name, ""), name, config_dir)
         else:
             heading = inspect.cleandoc(owner.__doc__ or "").partition("\n")[0].rstrip(".") + ":" if has_parts else ""
             after = next((place for place, key in enumerate(keys, 1) if key.name == "prior"), 0)
@@ -145,10 +147,10 @@ def _place(key: KeyHelp) -> int:
     return _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST)
 
 
-def _heading(field: dataclasses.Field[Any], chosen: str, config_dir: str) -> str:
+def _heading(field: dataclasses.Field[Any], chosen: str, name: str, config_dir: str) -> str:
     if not field.metadata.get("folder"):
         return f"{field.name}:"
-    option = chosen or field.metadata["option"]
+    option = chosen or name or field.metadata["option"]
     others = [other for other in field_options(field, config_dir) if other != option]
     return f"{field.name}={option}" + (f" (or {', '.join(others)}):" if others else ":")
 
@@ -217,7 +219,7 @@ def compose(command: str, config: type, words: Sequence[str], config_dir: str = 
     made |= by_hydra(command, config, named_options(made, fields, config_dir), config_dir)
     for key, value in values.items():
         made = _with(made, key, value, config, tree)
-    settings: Any = build(config, layered(config, tree, made), command=command)
+    settings: Any = build(config, with_implied(config, layered(config, tree, made)), command=command)
     if not adapter:
         return settings
     if not settings.prior:

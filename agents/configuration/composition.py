@@ -104,7 +104,10 @@ def build(kind: type[Config], tree: Mapping[str, Any], path: str = "", command: 
         ) from error
     except (errors.ConfigKeyError, errors.KeyValidationError) as error:
         known = [path + key for key in dotted(OmegaConf.to_container(schema))]  # type: ignore[arg-type]
-        raise unknown_name(f"{command} key".strip(), f"{path}{error.full_key}", known) from error
+        head = (error.full_key or "").partition(".")[0]
+        option = values[head].get("name") if head in parts else None
+        owner = f" with {path}{head}={option}," if option else ""
+        raise unknown_name(f"{command} key{owner}".strip(), f"{path}{error.full_key}", known) from error
     except errors.OmegaConfBaseException as error:
         place = (error.full_key or "").partition("[")[0]
         parent, _, name = place.rpartition(".")
@@ -441,7 +444,21 @@ def _complete(kind: type, given: Mapping[str, Any], fields: Mapping[str, datacla
     for name in given.keys() - options:
         is_part = dataclasses.is_dataclass(fields[name].default_factory) and isinstance(given[name], Mapping)
         tree = layered(kind, tree, {name: given[name]}) if is_part else {**tree, name: given[name]}
-    return {name: _group(fields[name], value) for name, value in tree.items()}
+    return {name: _group(fields[name], value) for name, value in with_implied(kind, tree).items()}
+
+
+def with_implied(kind: type, tree: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a config, with an option for each group that names none where the class method
+    ``implied_options`` of ``kind`` has one for these values.
+    """
+    implied = getattr(kind, "implied_options", None)
+    options = implied(tree) if implied else {}
+    groups = {name: (option, tree.get(name, {})) for name, option in options.items()}
+    return {**tree, **{
+        name: {"name": option, **group}
+        for name, (option, group) in groups.items()
+        if isinstance(group, Mapping) and "name" not in group
+    }}  # fmt: skip
 
 
 # Composition: Hydra composes the options chosen, its parser reads single values, OmegaConf resolves interpolations

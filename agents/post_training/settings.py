@@ -197,6 +197,9 @@ ENTRY_POINT_GROUP = "scene_envs.algorithms"
 
 AlgorithmClass = TypeVar("AlgorithmClass", bound=type)
 
+MEAN_REWARDS = ("clearance", "discriminator", "feasible_share", "reachability", "stability")
+"""Names of the package's rewards that are means over the objects of a scene (``averages_objects``)."""
+
 
 _FOLDER = "agents.post_training.algorithms"
 _ALGORITHMS: Registry[tuple[type[AlgorithmSettings], Any]] = Registry(
@@ -229,6 +232,23 @@ def register_algorithm(
     """
     _ALGORITHMS.check_name(name, "my_ddpo")
     return _ALGORITHMS.adding(name, lambda algorithm: (settings, algorithm))
+
+
+def default_algorithm(reward: Any) -> str:
+    """The algorithm of a run that names none: ``nft`` for a reward that is a mean over the objects of a scene, and for
+    sums of such rewards, which it raises most from equal numbers of scenes; ``ddpo_sf`` for others.
+
+    >>> default_algorithm("feasible_share"), default_algorithm({"name": "object_count"})
+    ('nft', 'ddpo_sf')
+    """
+
+    def is_mean(part: Any) -> bool:
+        if isinstance(part, Mapping) and part.get("name") == "weighted_sum":
+            return bool(part.get("rewards")) and all(map(is_mean, part["rewards"]))
+        name = part.get("name") if isinstance(part, Mapping) else part
+        return name in MEAN_REWARDS if isinstance(name, str) else bool(getattr(name, "averages_objects", False))
+
+    return "nft" if is_mean(reward) else "ddpo_sf"
 
 
 def list_algorithms() -> list[str]:
@@ -413,7 +433,7 @@ class PostTrainConfig(GuidanceKeys, SamplingKeys, EngineKeys, TrainingKeys, Prog
             for descriptions of grammar scenes; null for no prompt.
         guidance: weight of classifier-free guidance in the policy, 0 for none; needs a prompt.
         seed: seed of the initial noise, the chain's noise, the choice of steps and the real scenes.
-        algorithm: the post-training algorithm.
+        algorithm: the post-training algorithm; by default that of :func:`default_algorithm`.
         optimizer: the optimiser of the weights.
         regularisation: losses that keep the prior near real scenes.
         guard: checks on held-out real scenes.
@@ -438,6 +458,11 @@ class PostTrainConfig(GuidanceKeys, SamplingKeys, EngineKeys, TrainingKeys, Prog
     logger: PostTrainLoggerSettings = nested(
         PostTrainLoggerSettings, folder="logger", option="csv", registered=lambda: LOGGERS
     )
+
+    @classmethod
+    def implied_options(cls, values: Mapping[str, Any]) -> dict[str, str]:
+        """Options of the groups for which ``values`` choose none."""
+        return {"algorithm": default_algorithm(values.get("reward", cls.reward))}
 
     def __post_init__(self) -> None:
         super().__post_init__()

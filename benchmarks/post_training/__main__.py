@@ -20,7 +20,8 @@ class PostTrainingTables:
     """A table of post-training: its runs, their samples and those of the base priors.
 
     Attributes:
-        table: stability, placement, equal_scenes, counts, prompts, realism, frontier or losses.
+        table: stability, placement, equal_scenes, counts, prompts, realism, frontier, losses or
+            long_losses.
         rows: patterns of the names of rows to run and show, such as [dimsum_table-nft-*]; empty for all.
         iterations: iterations of every run; null takes the number of the table.
         count: number of measured samples of each prior.

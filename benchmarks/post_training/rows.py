@@ -89,6 +89,8 @@ _960_SCENES = ("batch_size=24", "guard.scenes=128", "guard.samples=128", "guard.
 """Keys of 40 iterations with 960 sampled scenes."""
 _LAST = ("batch_size=24", "guard.scenes=128", "guard.samples=0", "guard.every=40", "regularisation.bank_size=1152")
 """The same without samples of the guard, which checks the last prior only and so keeps it."""
+_14400_SCENES = ("batch_size=24", "guard.scenes=128", "guard.samples=128", "guard.every=50", "guard.samples_every=50")
+"""Keys of 600 iterations with 14,400 sampled scenes."""
 
 
 def _equal_scenes() -> tuple[Row, ...]:
@@ -101,17 +103,19 @@ def _equal_scenes() -> tuple[Row, ...]:
     )
 
 
-def _losses() -> tuple[Row, ...]:
-    """Every loss after 960 sampled scenes of Dimsum, the losses of ``examples/`` too: two rewards, three seeds."""
+def _losses(iterations: int, *keys: str) -> tuple[Row, ...]:
+    """Every loss on three scene types, the losses of ``examples/`` too: two rewards, three seeds on Dimsum."""
+    learned = "algorithm.expectation_lr=3e-4"
     return tuple(
-        Row(f"dimsum_table-{name}-{reward}-{seed}", "dimsum_table",
-            (*_keys(algorithm, reward, seed), *more, *_LAST), 40)
-        for seed in range(3)
+        Row(f"{prior}-{name}-{reward}-{seed}", prior, (*_keys(algorithm, reward, seed), *more, *keys), iterations,
+            guidance=1.0 if prior == "dimsum_table" else 0.5)
+        for prior, seeds in (("dimsum_table", 3), ("living_room_shelf", 1), ("restaurant_low_clutter", 1))
+        for seed in range(seeds)
         for reward in ("feasible_share", "object_count")
         for name, algorithm, more in (
             *((name, name, ()) for name in (FORWARD, "awm", CHAIN, "ddpo_is", DISTILLATION, *PLUG_INS)),
-            ("udm_grpo_averaged", "udm_grpo", ("algorithm.sampler_decay=0.9", "algorithm.expectation_lr=3e-4")),
-            ("crd_averaged", "crd", ("algorithm.expectation_lr=3e-4",)),
+            ("udm_grpo_averaged", "udm_grpo", ("algorithm.sampler_decay=0.99", learned)),
+            ("crd_averaged", "crd", (learned,)),
         )
     )  # fmt: skip
 
@@ -177,10 +181,14 @@ TABLES: dict[str, Table] = {
     "equal_scenes": Table("Feasible share after 960 scenes", _equal_scenes(), (),
                           ("base_reward", "guard_reward", "kept", "loss", "guard_counts", "base_classifier",
                            "guard_classifier")),
-    "losses": Table("Losses after 960 scenes", _losses(), ("layout", "physics"),
+    "losses": Table("Losses after 960 scenes", _losses(40, *_LAST), ("layout", "physics"),
                     ("share", "free", "collision", "loss", "count_wasserstein", "category_kl", "spacing",
                      "training_seconds"),
                     ("num_steps=25", "pictures=0")),
+    "long_losses": Table("Losses after 14,400 scenes", _losses(600, *_14400_SCENES), _WITH_PROMPTS,
+                         ("last", "fall", "kept", *_LAYOUT, "spacing", "prompt_counts", "prompt_names",
+                          "prompt_relations", "training_seconds"),
+                         ("prompt_count=180", "pictures=0")),
     "counts": Table("Object counts past the data", _counts(), ("layout", "physics"),
                     ("free", "feasible", "share", "loss", "count_wasserstein", "category_kl")),
     "prompts": Table("Following prompts", _prompts(), _WITH_PROMPTS,

@@ -29,7 +29,8 @@ from agents.configuration.composition import (
 )
 from agents.planning import list_planners
 from agents.planning.ledger import planner_settings
-from agents.post_training.settings import algorithm_settings, list_algorithms
+from agents.post_training.settings import MEAN_REWARDS, algorithm_settings, list_algorithms
+from rewards import facts_of, list_rewards, make_reward
 from scene_envs.errors import InvalidInputError, UnknownNameError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -147,6 +148,33 @@ def test_a_recipe_is_the_same_in_python(kind: Any, recipe: str) -> None:
     given = kind(recipe=recipe, iterations=3, optimizer={"lr": 0.5})
     assert given == compose("x", kind, [f"recipe={recipe}", "optimizer.lr=0.5", "iterations=3"])
     assert dataclasses.replace(given, seed=4) == changed(given, {"seed": 4})
+
+
+@pytest.mark.parametrize(
+    ("reward", "algorithm"),
+    [
+        ("feasible_share", "nft"),
+        ("{name: weighted_sum, rewards: [feasible_share, {name: discriminator}]}", "nft"),
+        ("{name: weighted_sum, rewards: [feasible_share, object_count]}", "ddpo_sf"),
+        ("{name: product, rewards: [feasible_share]}", "ddpo_sf"),
+        ("feasible_objects", "ddpo_sf"),
+    ],
+)
+def test_the_reward_chooses_the_algorithm_of_a_run_that_names_none(reward: str, algorithm: str) -> None:
+    word = f"reward={reward}"
+    for made in (compose("x", PostTrainConfig, [word]), PostTrainConfig(reward=yaml.safe_load(reward))):
+        assert made.algorithm.name == algorithm
+        assert made.optimizer.lr == made.algorithm.learning_rate
+    assert compose("x", PostTrainConfig, [word, "algorithm=awm"]).algorithm.name == "awm"
+    assert compose("x", PostTrainConfig, [word, "recipe=demo_clutter"]).algorithm.name == "ddpo_sf"
+    assert compose("x", PostTrainConfig, [word, "algorithm.scenes_per_prompt=4"]).algorithm.name == algorithm
+    assert f"algorithm={algorithm} (or" in help_text(compose("x", PostTrainConfig, [word]))
+
+
+def test_rewards_of_runs_with_nft_are_means_over_objects() -> None:
+    plain = {*list_rewards()} - {"clip", "product", "weighted_sum"}
+    assert {name for name in plain if facts_of(make_reward(name))["averages_objects"]} == {*MEAN_REWARDS}
+    assert PostTrainConfig(reward=make_reward("stability")).algorithm.name == "nft"
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from types import ModuleType
 from agents import cli
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import describe_fields, keys_of
+from agents.post_training.settings import default_algorithm
 from tests.helpers.doc_folders import prepare
 from tests.helpers.doc_pages import INSTEAD, NOT_RUN, ROOT, ROWS, SMALL_KEYS
 
@@ -83,7 +84,8 @@ def _small(name: str, words: list[str]) -> list[str]:
     if "scenes" in {word.partition("=")[0] for word in words} and name != "view":
         sizes.pop("count", None)
         sizes.pop("slots", None)  # the scenes have their own
-    if name == "post-train" and any(word.startswith("algorithm=") for word in words):
+    chosen = dict(word.partition("=")[::2] for word in words)
+    if name == "post-train" and ("algorithm" in chosen or default_algorithm(chosen.get("reward")) != "ddpo_sf"):
         sizes.pop("algorithm.gradient_steps", None)  # of DDPO alone
     if name == "post-train" and any(word.startswith("prompt=") for word in words):
         sizes.pop("slots", None)  # prompts of real scenes ask for as many objects as those have

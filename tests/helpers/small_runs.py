@@ -40,7 +40,7 @@ def small_config(output: Path | str, **changes: Any) -> PostTrainConfig:
         iterations=4,
         batch_size=6,
         num_steps=3,
-        algorithm={"gradient_steps": 2},
+        algorithm={"name": "ddpo_sf", "gradient_steps": 2},
         regularisation={"weight": 1.0, "batch_size": 6, "bank_size": 24},
         guard={"scenes": 8, "every": 2},
         logger={"checkpoint_every": 2},
