@@ -236,16 +236,17 @@ def register_algorithm(
 
 def default_algorithm(reward: Any) -> str:
     """The algorithm of a run that names none: ``nft`` for a reward that is a mean over the objects of a scene, and for
-    sums of such rewards, which it raises most from equal numbers of scenes; ``ddpo_sf`` for others.
+    sums and clips of such rewards, which it raises most from equal numbers of scenes; ``ddpo_sf`` for others.
 
     >>> default_algorithm("feasible_share"), default_algorithm({"name": "object_count"})
     ('nft', 'ddpo_sf')
     """
 
     def is_mean(part: Any) -> bool:
-        if isinstance(part, Mapping) and part.get("name") == "weighted_sum":
-            return bool(part.get("rewards")) and all(map(is_mean, part["rewards"]))
         name = part.get("name") if isinstance(part, Mapping) else part
+        if isinstance(part, Mapping) and name in ("weighted_sum", "clip"):
+            parts = part.get("rewards", [part.get("reward")])
+            return isinstance(parts, list | tuple) and bool(parts) and all(map(is_mean, parts))
         return name in MEAN_REWARDS if isinstance(name, str) else bool(getattr(name, "averages_objects", False))
 
     return "nft" if is_mean(reward) else "ddpo_sf"

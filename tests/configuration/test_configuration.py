@@ -157,6 +157,7 @@ def test_a_recipe_is_the_same_in_python(kind: Any, recipe: str) -> None:
         ("{name: weighted_sum, rewards: [feasible_share, {name: discriminator}]}", "nft"),
         ("{name: weighted_sum, rewards: [feasible_share, object_count]}", "ddpo_sf"),
         ("{name: product, rewards: [feasible_share]}", "ddpo_sf"),
+        ("{name: clip, reward: stability, high: 0.9}", "nft"),
         ("feasible_objects", "ddpo_sf"),
     ],
 )
