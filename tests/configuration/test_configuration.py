@@ -176,6 +176,8 @@ def test_rewards_of_runs_with_nft_are_means_over_objects() -> None:
     plain = {*list_rewards()} - {"clip", "product", "weighted_sum"}
     assert {name for name in plain if facts_of(make_reward(name))["averages_objects"]} == {*MEAN_REWARDS}
     assert PostTrainConfig(reward=make_reward("stability")).algorithm.name == "nft"
+    with pytest.raises(UnknownNameError, match=r"key with algorithm=nft, 'algorithm\.gradient_steps'"):
+        compose("x", PostTrainConfig, ["reward=stability", "algorithm.gradient_steps=2"])
 
 
 @pytest.mark.slow
