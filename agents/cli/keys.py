@@ -101,7 +101,7 @@ def help_text(config: type | Any, words: Sequence[str] = (), config_dir: str = "
     for owner, keys in sections:
         if not isinstance(owner, type):
             name = getattr(getattr(config, owner.name, None), "name", "")
-            heading = _heading(owner, chosen.get(owner.name, ""), name, config_dir)
+            heading = _heading(owner, chosen.get(owner.name, name), config_dir)
         else:
             heading = inspect.cleandoc(owner.__doc__ or "").partition("\n")[0].rstrip(".") + ":" if has_parts else ""
             after = next((place for place, key in enumerate(keys, 1) if key.name == "prior"), 0)
@@ -147,10 +147,10 @@ def _place(key: KeyHelp) -> int:
     return _FIRST.index(key.name) if key.name in _FIRST else len(_FIRST)
 
 
-def _heading(field: dataclasses.Field[Any], chosen: str, name: str, config_dir: str) -> str:
+def _heading(field: dataclasses.Field[Any], chosen: str, config_dir: str) -> str:
     if not field.metadata.get("folder"):
         return f"{field.name}:"
-    option = chosen or name or field.metadata["option"]
+    option = chosen or field.metadata["option"]
     others = [other for other in field_options(field, config_dir) if other != option]
     return f"{field.name}={option}" + (f" (or {', '.join(others)}):" if others else ":")
 

@@ -452,13 +452,11 @@ def with_implied(kind: type, tree: Mapping[str, Any]) -> dict[str, Any]:
     ``implied_options`` of ``kind`` has one for these values.
     """
     implied = getattr(kind, "implied_options", None)
-    options = implied(tree) if implied else {}
-    groups = {name: (option, tree.get(name, {})) for name, option in options.items()}
-    return {**tree, **{
-        name: {"name": option, **group}
-        for name, (option, group) in groups.items()
-        if isinstance(group, Mapping) and "name" not in group
-    }}  # fmt: skip
+    values = dict(tree)
+    for name, option in (implied(tree) if implied else {}).items():
+        if isinstance(group := tree.get(name, {}), Mapping):
+            values[name] = {"name": option, **group}  # its own name wins
+    return values
 
 
 # Composition: Hydra composes the options chosen, its parser reads single values, OmegaConf resolves interpolations
