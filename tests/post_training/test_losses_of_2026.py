@@ -192,7 +192,7 @@ class TestGARDO:
         uncertain = torch.tensor([[True], [False], [False], [True]])
         scenes = own_scenes(prior, advantage=torch.zeros(4, 1), uncertain=uncertain)
         loss = gardo.GARDOLoss(prior, deepcopy(prior))
-        loss.reference, loss.penalty = tiny_prior("dimsum_table", seed=1, process=prior.process_name), 0.5
+        loss.reference, loss.penalty = tiny_prior("dimsum_table", seed=1, process=prior.process_name), 500.0
         noised = prior.noised(scenes["scene"], Generator().manual_seed(3))
         with_penalty = float(loss.of_noised(noised, scenes)["loss_objective"].detach())
         without = float(NFTLoss(prior, prior).of_noised(noised, scenes)["loss_objective"].detach())
@@ -203,7 +203,7 @@ class TestGARDO:
             base = Categorical(logits=said.logits)
             kl = torch.distributions.kl_divergence(base, Categorical(logits=output.logits))
             far = far + prior.config.category_weight * (kl * noised.drawn).sum(1) / noised.drawn.sum(1).clamp(min=1.0)
-        assert with_penalty - without == pytest.approx(0.5 * float(far[[0, 3]].sum().detach()) / 4, rel=1e-4, abs=1e-6)
+        assert with_penalty - without == pytest.approx(500.0 * float(far[[0, 3]].sum().detach()) / 4, rel=1e-4)
 
     def test_diverse_good_scenes_have_more_advantage(self, gardo: ModuleType) -> None:
         """Two equal good scenes have a nearest neighbour at distance 0, a third good one has the mean's threefold."""
