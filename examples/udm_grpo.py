@@ -21,7 +21,8 @@ What the paper leaves open, and our reading. We know its abstract and its figure
     an earlier clip. Levels of noise have the weights of pretraining.
  3. The joint action. Pose and category are independent given x_t, so log rho is their sum, and each factor is clipped
     by itself. Poses take the advantage of their slot where the reward has credit per object, categories that of the
-    scene (``category_credit``).
+    scene (``category_credit``). Ratios end at 10 (dual clip): the target of an object that stands where its category
+    never does is tens of standard deviations from 0, and its ratio overflows.
  4. The gradient at rho = 1 is that of -A log p(x_0 | x_t): for poses that of AWM without its pull, times c / (2 s^2).
     The clip takes the place of the pull. The paper's KL term is here the pretraining loss on real scenes, which the
     training loop adds (``regularisation.weight``).
@@ -41,6 +42,7 @@ from torch.nn import functional as F
 
 from agents.cli import main
 from agents.post_training import ForwardProcess, ForwardProcessLoss, register_algorithm
+from agents.post_training.algorithms.base import bounded_ratio
 from agents.post_training.settings import ForwardProcessSettings
 from scene_envs.errors import BELOW_ONE, Positive, Unlimited, at_least
 
@@ -83,7 +85,7 @@ class UDMGRPOLoss(ForwardProcessLoss):
 
     def surrogate(self, log_ratio: Tensor, advantage: Tensor) -> Tensor:
         """The loss of actions with these log ratios."""
-        ratio, credit = log_ratio.exp(), advantage.clamp(-self.clip, self.clip)
+        ratio, credit = bounded_ratio(log_ratio), advantage.clamp(-self.clip, self.clip)
         return -torch.minimum(ratio * credit, ratio.clamp(1 - self.beta, 1 + self.beta) * credit)
 
 

@@ -205,14 +205,18 @@ def test_clipped_objective_before_the_first_update_has_the_score_function_gradie
     torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-5, atol=1e-6)
 
 
-def test_clip_stops_the_gradient_of_rows_that_have_moved_far_enough() -> None:
+@pytest.mark.parametrize(("advantage", "log_ratio", "loss"), [(1.0, 1.0, -1.2), (-1.0, 200.0, 10.0)])
+def test_clip_stops_the_gradient_of_rows_that_have_moved_far_enough(
+    advantage: float, log_ratio: float, loss: float
+) -> None:
+    """A ratio of e is beyond 1.2 with a positive advantage; one that overflows counts as 10."""
     chain = LinearChain(THETA, SIGMAS)
     x2, x1, _ = draw_chain(1)
-    batch = transitions(x2, 3, x1, torch.ones(1, dtype=torch.float64))
+    batch = transitions(x2, 3, x1, torch.full((1,), advantage, dtype=torch.float64))
     now = Normal(THETA * x2, SIGMAS[0]).log_prob(x1)
-    batch["slot_log_prob"] = (now - 1.0).reshape(1, 1)  # the ratio is e: beyond 1.2 with a positive advantage
+    batch["slot_log_prob"] = (now - log_ratio).reshape(1, 1)
     result = DDPOSFLoss(DenoisingPolicy(chain, 3), clip_epsilon=0.2)(batch)
-    assert result["loss_objective"].item() == pytest.approx(-1.2)
+    assert result["loss_objective"].item() == pytest.approx(loss)
     result["loss_objective"].backward()
     assert float(chain.theta.grad) == 0.0
     assert float(result["clip_fraction"]) == 1.0

@@ -97,6 +97,17 @@ class TestUDMGRPO:
         assert float(value.detach()) == pytest.approx(-min(math.exp(moved) * advantage, bounded * advantage))
         assert bool(log_ratio.grad) is pushes
 
+    @pytest.mark.parametrize("advantage", [0.0, 1.0, -1.0])
+    def test_an_outlier_has_no_gradient(self, udm_grpo: ModuleType, advantage: float) -> None:
+        """The target lies 20 standard deviations from the older output and on the new one: the ratio is e^200."""
+        loss = udm_grpo.UDMGRPOLoss(tiny_prior(), tiny_prior())
+        target = torch.tensor(20.0)
+        output = target.clone().requires_grad_()
+        value = loss.continuous_loss(output, torch.tensor(0.0), target, torch.tensor(advantage))
+        value.backward()
+        assert math.isfinite(float(value.detach()))
+        assert float(output.grad) == 0.0
+
 
 class TestCRD:
     """Of two finished scenes with targets +1 and -1 at one x_t, the first has the better reward."""

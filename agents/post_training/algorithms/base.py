@@ -181,6 +181,22 @@ def in_parts(parameters: Iterable[nn.Parameter], count: int, chunk: int | None) 
         parameter.grad = gradient
 
 
+MAX_RATIO = 10.0
+"""Largest ratio of probabilities in a clipped objective."""
+
+
+def bounded_ratio(log_ratio: Tensor) -> Tensor:
+    """Ratios of probabilities, at most :data:`MAX_RATIO`, from their logarithms; larger ones have no gradient.
+
+    The clip of PPO bounds what an action with a positive advantage gains, not what one with a negative advantage loses:
+    one outlier would give the whole gradient, and an infinite ratio makes it NaN. (Dual clip; Ye et al. 2020, Eq. 5)
+
+    >>> bounded_ratio(torch.tensor([0.0, 200.0]))
+    tensor([ 1., 10.])
+    """
+    return log_ratio.clamp(max=math.log(MAX_RATIO)).exp()
+
+
 def gradient_norm(parameters: Iterable[nn.Parameter]) -> float:
     """Euclidean norm of all ``.grad``; 0 when there is none."""
     norms = [p.grad.norm() for p in parameters if p.grad is not None]

@@ -14,6 +14,7 @@ from agents.post_training.algorithms.base import (
     BatchGradient,
     PlainLoss,
     accepted_keys,
+    bounded_ratio,
     in_parts,
 )
 from agents.post_training.policy import DenoisingPolicy, gradient_weights
@@ -147,7 +148,7 @@ class DDPOSFLoss(PlainLoss):
         log_prob = log_prob / entries
         if self.clip_epsilon is None or old is None:
             return (advantage * log_prob).sum(dim=1), torch.zeros_like(advantage[:, 0])
-        ratio = (log_prob - old / entries).exp()
+        ratio = bounded_ratio(log_prob - old / entries)
         bounded = ratio.clamp(1 - self.clip_epsilon, 1 + self.clip_epsilon)
         surrogate = torch.minimum(ratio * advantage, bounded * advantage)
         return surrogate.sum(dim=1), (ratio != bounded).float().mean(dim=1).detach()
