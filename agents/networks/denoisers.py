@@ -302,6 +302,7 @@ class MixedDenoiser(_Denoiser):
         self.register_buffer("_certain", certain, persistent=False)
         self.register_buffer("_mean", mean, persistent=False)
         self.register_buffer("_std", std, persistent=False)
+        self.reads_estimate = getattr(network.config, "reads_estimate", False)
         self.reads_log_noise = getattr(network.config, "time_input", "timestep") == "log_noise"
         self.text_encoder = text_encoder
         self.categories = categories
@@ -346,7 +347,8 @@ class MixedDenoiser(_Denoiser):
             level = torch.where(observed.pose, torch.zeros_like(level), level)
         steps = t if isinstance(t, Tensor) else torch.full((len(pose),), t, device=pose.device)
         time = 250.0 * ratio.log() if self.reads_log_noise else (steps - 1).to(pose.dtype)
-        inputs = [scaled, states, position, level, *([] if observed is None else [observed.flags()])]
+        clean = self._affine(pose, states, t) if self.reads_estimate else ()
+        inputs = [scaled, states, position, level, *clean, *([] if observed is None else [observed.flags()])]
         if self.drops_empty:
             output, logits = self._on_present(inputs, time, text)
             certain = F.embedding(states, self._certain).to(logits)
@@ -361,10 +363,14 @@ class MixedDenoiser(_Denoiser):
     def _run(
         self, inputs: Sequence[Tensor], time: Tensor, text: Text | None, slot_mask: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The network on scaled poses, states, positions, noise levels and, where there are any, observed flags."""
+        """The network on scaled poses, states, positions, noise levels, what :meth:`_affine` gives if the network reads
+        it, and observed flags where there are any.
+        """
         scaled, states, position, level, *flags = inputs
         tokens, mask = (None, None) if text is None else text
         extra = {} if slot_mask is None else {"slot_mask": slot_mask}
+        if self.reads_estimate:
+            extra["clean_offset"], extra["clean_scale"], *flags = flags
         with autocast(scaled, self.precision):
             output, logits = self.replays.run(
                 self.network, scaled, states, time, text=tokens, text_mask=mask, position=position, noise_level=level,
@@ -389,14 +395,24 @@ class MixedDenoiser(_Denoiser):
         """The clean pose (B, N, 12), normalised, and the logits of the clean category (B, N, K)."""
         output, logits = self.output(x_t, t, observed, text)
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
+        return self._denoised(pose, states, t, output), logits
+
+    @torch.no_grad()
+    def _affine(self, pose: Tensor, states: Tensor, t: Tensor | int) -> tuple[Tensor, Tensor]:
+        """Offset and scale (B, N, 12): offset + scale * pose output is the clean pose."""
+        offset = self._denoised(pose, states, t, torch.zeros_like(pose))
+        return offset, self._denoised(pose, states, t, torch.ones_like(pose)) - offset
+
+    def _denoised(self, pose: Tensor, states: Tensor, t: Tensor | int, output: Tensor) -> Tensor:
+        """The clean pose (B, N, 12) of noisy poses and states, from the pose output."""
         if isinstance(t, Tensor) or self._mean is None or self._std is None or self.process.prediction != "edm":
             moments = self.moments(states, t) if isinstance(t, Tensor) else None
-            return self.process.x0_from_output(pose, t, output, moments), logits
+            return self.process.x0_from_output(pose, t, output, moments)
         of_states = self._mean[t], self._std[t]
         tables = self.process.once(
             t, pose, "states", lambda: (torch.stack(self.process.output_scaling(t, pose, of_states), 1),)
         )
-        return self.process.x0_from_output(pose, t, output, None, tables[0][states].unbind(-2)), logits
+        return self.process.x0_from_output(pose, t, output, None, tables[0][states].unbind(-2))
 
 
 # -- packing: slots that are known to be empty are left out of a batch ----------------------------

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, ClassVar
 
@@ -35,6 +35,7 @@ from agents.networks.flux_modules import (
 )
 from agents.networks.geometry import (
     ContactsConfig,
+    RefinementConfig,
     RelationsConfig,
     RotationFeaturesConfig,
     joint_attention,
@@ -294,6 +295,7 @@ MODULES: dict[str, type[ModuleConfig]] = {
         FourierFeaturesConfig,
         RotationFeaturesConfig,
         ContactsConfig,
+        RefinementConfig,
     )
 }
 """The configurations of all modules by name; a new module is one more entry."""
@@ -376,6 +378,15 @@ class MixedFluxConfig:
     def pair_width(self) -> int:
         """Features of a pair of slots, of all modules."""
         return sum(module.pair_width for module in self.modules)
+
+    @property
+    def reads_estimate(self) -> bool:
+        """Whether a module reads the denoised scene."""
+        return any(module.reads_estimate for module in self.modules)
+
+    def block(self, pairs: int) -> SingleStreamBlock:
+        """A single-stream block with fresh weights, on ``pairs`` features of a pair of slots."""
+        return SingleStreamBlock(self.hidden, self.heads, self.mlp_ratio, pairs)
 
     def state(self) -> dict[str, Any]:
         """The fields for a file, the names of the modules among theirs."""
@@ -464,7 +475,8 @@ class MixedFlux(nn.Module):
     def forward(
         self, pose: Tensor, states: Tensor, time: Tensor, *, text: Tensor | None = None,
         text_mask: Tensor | None = None, position: Tensor | None = None, noise_level: Tensor | None = None,
-        observed: Tensor | None = None, slot_mask: Tensor | None = None,
+        observed: Tensor | None = None, slot_mask: Tensor | None = None, clean_offset: Tensor | None = None,
+        clean_scale: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Predict.
 
@@ -480,6 +492,8 @@ class MixedFlux(nn.Module):
             observed: (B, N) int64, 1 where the pose is observed, plus 2 where the category is; None if nothing is
                 observed.
             slot_mask: (B, N) bool, False for padding slots, to which nothing may attend; None where there are none.
+            clean_offset, clean_scale: (B, N, 12) each, for modules that read the denoised scene: its poses in signal
+                units are offset + scale * pose output.
 
         Returns:
             pose output (B, N, 12) and logits (B, N, K) of the clean category.
@@ -502,7 +516,27 @@ class MixedFlux(nn.Module):
         shift, scale = self.final_modulation(condition).unsqueeze(1).chunk(2, dim=-1)
         features = self.final((1 + scale) * F.layer_norm(tokens, (self.config.hidden,), eps=1e-6) + shift)
         logits = self._add(self.logits_out(features), lambda module: module.logits(scene))
-        return self._add(self.pose_out(features), lambda module: module.pose_output(scene, features)), logits
+        output = self._add(self.pose_out(features), lambda module: module.pose_output(scene, features))
+        if not self.config.reads_estimate:
+            return output, logits
+        if clean_offset is None or clean_scale is None:
+            raise InvalidInputError("a network with refinement needs clean_offset= and clean_scale=")
+        scene.estimate = clean_offset, clean_scale
+        return self._add(output, lambda module: module.correction(scene, tokens, condition, output)), logits
+
+    def refined(self, shapes: Sequence[Sequence[float]]) -> MixedFlux:
+        """This network with a refinement whose correction is 0, for assets of these ``shapes``, see
+        :class:`~agents.networks.geometry.RefinementConfig`.
+
+        Raises:
+            InvalidInputError: it has no contacts, or a refinement already.
+        """
+        added = RefinementConfig(tuple(tuple(shape) for shape in shapes))
+        with torch.random.fork_rng():  # the random state of the caller stays
+            network = MixedFlux(replace(self.config, modules=(*self.config.modules, added)))
+        network.load_state_dict(self.state_dict(), strict=False)
+        network.get_submodule(RefinementConfig.name).start_like(self)  # type: ignore[operator]
+        return network.to(next(self.parameters()).device)
 
     def groups_by_number(self, text: Tensor) -> Tensor | None:
         """(B, K) int64 groups of categories by the numbers that ``text`` (B, L, W) gives; None without such a module.

@@ -40,6 +40,8 @@ class Scene:
         rotation: (B, N, 3, 3) the rotations nearest to ``noisy_rotation``.
         rotation_noise: (B, N) standard deviation of the noise on the entries of a rotation.
         pairs: (B, N, N, F) features of pairs of slots, of all modules together; None before any are computed.
+        estimate: offset and scale, (B, N, 12) each: offset + scale * pose output is the denoised pose, in signal units;
+            None where no module reads it.
         kept: tensors that a module stores in one hook for a later hook of its own, by the name of the module.
     """
 
@@ -56,6 +58,7 @@ class Scene:
     rotation: Tensor | None = None
     rotation_noise: Tensor | None = None
     pairs: Tensor | None = None
+    estimate: tuple[Tensor, Tensor] | None = None
     kept: dict[str, Tensor] = field(default_factory=dict)
 
 
@@ -111,6 +114,13 @@ class FluxModule(nn.Module):
         """(B, N, 12) that is added to the pose output; ``features`` (B, N, E) leave the core's last layer."""
         return None
 
+    def correction(self, scene: Scene, tokens: Tensor, condition: Tensor, output: Tensor) -> Tensor | None:
+        """(B, N, 12) that is added to the pose ``output`` (B, N, 12), for modules that read the denoised scene.
+
+        ``tokens`` (B, N, H) leave the last block; ``condition`` (B, H) modulates the blocks.
+        """
+        return None
+
 
 @dataclass(frozen=True)
 class ModuleConfig(ABC):
@@ -125,6 +135,7 @@ class ModuleConfig(ABC):
         reads_geometry: whether it reads positions and the noise on them.
         reads_rotations: whether it reads rotations, too.
         reads_text: whether it needs a network with text.
+        reads_estimate: whether it reads the denoised scene.
     """
 
     name: ClassVar[str]
@@ -133,6 +144,7 @@ class ModuleConfig(ABC):
     reads_geometry: ClassVar[bool] = False
     reads_rotations: ClassVar[bool] = False
     reads_text: ClassVar[bool] = False
+    reads_estimate: ClassVar[bool] = False
 
     @property
     def pose_width(self) -> int:

@@ -20,6 +20,7 @@ from agents.diffusion.categorical import make_categorical_schedule, one_hot
 from agents.diffusion.gaussian import loss_weights
 from agents.diffusion.reverse_steps import ReverseStep, state_of
 from agents.networks.denoisers import MixedDenoiser, Observed
+from agents.networks.flux import MixedFlux
 from agents.networks.flux_modules import CountConditioning
 from agents.networks.registry import build_network
 from agents.networks.text import PADDING, Text, TextEncoder, vocabulary, warn_unknown
@@ -275,6 +276,29 @@ class MixedPrior(ScenePrior):
     def with_open_empty(self, share: float) -> MixedPrior:
         """This prior; in its training, ``share`` of the masks of whole slots include every empty slot."""
         self.config = replace(self.config, open_empty_share=share)
+        return self
+
+    def with_refinement(self) -> MixedPrior:
+        """This prior, whose network corrects denoised scenes (:class:`~agents.networks.geometry.Refinement`).
+
+        A new refinement corrects nothing until it is trained; a prior that has one is not changed.
+
+        Raises:
+            InvalidInputError: the assets have no geometry, or the network no contacts.
+        """
+        network = self.denoiser.network
+        if self.denoiser.reads_estimate:
+            return self
+        if not isinstance(network, MixedFlux) or not hasattr(network, "contacts") or not self.scene_type.has_geometry:
+            raise InvalidInputError(
+                "a refinement needs a mixed flux network with contacts, and assets with geometry, and "
+                f"{self.loaded_as or self.scene_type.name!r} lacks one of them; take another prior"
+            )
+        boxes = [self.scene_type.library[name].bounds for name in self.scene_type.assets]  # (2, 3) each
+        shapes = [[*(0.5 * (low + high)).tolist(), *(0.5 * (high - low)).tolist()] for low, high in boxes]
+        self.denoiser.network = network.refined(shapes).train(network.training)
+        self.denoiser.reads_estimate = True
+        self.config = replace(self.config, network=self.denoiser.network.config)
         return self
 
     # -- the reverse chain ------------------------------------------------------------------------
