@@ -534,9 +534,10 @@ class MixedFlux(nn.Module):
         added = RefinementConfig(tuple(tuple(shape) for shape in shapes))
         with torch.random.fork_rng():  # the random state of the caller stays
             network = MixedFlux(replace(self.config, modules=(*self.config.modules, added)))
+        network = network.to(next(self.parameters()))
         network.load_state_dict(self.state_dict(), strict=False)
         network.get_submodule(RefinementConfig.name).start_like(self)  # type: ignore[operator]
-        return network.to(next(self.parameters()).device)
+        return network
 
     def groups_by_number(self, text: Tensor) -> Tensor | None:
         """(B, K) int64 groups of categories by the numbers that ``text`` (B, L, W) gives; None without such a module.

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -35,9 +35,6 @@ from scene_envs.errors import unknown_name
 from scene_envs.normalizer import constant_on
 from scene_envs.rotations import quaternion_to_matrix
 from scene_envs.scene import POSE_FEATURES
-
-if TYPE_CHECKING:
-    from agents.networks.flux import MixedFlux
 
 # -- rotations ------------------------------------------------------------------------------------
 
@@ -596,7 +593,7 @@ class Refinement(FluxModule):
         self.register_buffer("unit", torch.tensor(core.unit), persistent=False)
         self.register_buffer("rotations", torch.tensor(core.rotations), persistent=False)
 
-    def start_like(self, network: MixedFlux) -> None:
+    def start_like(self, network: Any) -> None:
         """Take the weights of a network's relations, contacts, last block and last layers; the correction is then 0."""
         fresh = ("out.", "gates.", "touch.2.")  # these are 0 at the start
         parts: list[tuple[nn.Module, Any]] = [
@@ -612,7 +609,9 @@ class Refinement(FluxModule):
         if scene.estimate is None or scene.position is None or scene.noise_level is None:
             return None
         with torch.autocast(output.device.type, enabled=False):  # as in Contacts
-            noise, tokens = _ESTIMATE_NOISE * scene.noise_level, tokens.float()
+            wide = self.final.weight.dtype
+            tokens, condition, output = tokens.to(wide), condition.to(wide), output.to(wide)
+            noise = _ESTIMATE_NOISE * scene.noise_level
             with torch.no_grad():
                 offset, scale = scene.estimate
                 pose = torch.where((noise == 0)[..., None], scene.position, offset + scale * output)

@@ -89,7 +89,7 @@ class Learner:
         self.deck: PromptDeck | None = None
         self.scenes_per_prompt = algorithm.scenes_per_prompt
         self.parameters = [p for p in self.prior.parameters() if p.requires_grad]
-        self.lr = optimizer.lr or algorithm.rate
+        self.lr = optimizer.lr or algorithm.learning_rate
         self.optimizer = torch.optim.AdamW(self.parameters, lr=self.lr, weight_decay=0.0, betas=(0.9, 0.999))
 
     def close(self) -> None:

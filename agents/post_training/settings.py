@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -70,15 +69,6 @@ class AlgorithmSettings(Checked):
     def optimiser_steps(self) -> int:
         """Optimiser steps per batch: the key ``updates`` of algorithms that have it."""
         return getattr(self, "updates", 1)
-
-    @property
-    def rate(self) -> float:
-        """Learning rate of a run whose ``optimizer.lr`` is None."""
-        return self.learning_rate
-
-    def started(self, prior: Any) -> Any:
-        """The prior that a run of ``prior`` starts from; ``prior`` itself stays as it is."""
-        return prior
 
 
 @dataclass
@@ -188,8 +178,6 @@ class GuidanceDistillationSettings(AlgorithmSettings):
         strength: strength of the physics guidance that is learned, 0 to 1.
         clip: largest move of an object that is learned at a step, in standard deviations of its denoised position.
         sampler_decay: decay of the averaged weights that sample, per iteration.
-        trains: ``all`` weights, or those of the ``refinement`` of the network alone, which is added to priors without
-            one.
     """
 
     learning_rate: ClassVar[float] = 2e-4
@@ -202,14 +190,6 @@ class GuidanceDistillationSettings(AlgorithmSettings):
     strength: Annotated[float, Limit(lambda value: 0 < value <= 1, "must lie in (0, 1]; 1 learns whole moves")] = 1.0
     clip: Unlimited = 1.0
     sampler_decay: Annotated[float, BELOW_ONE] = 0.9
-    trains: Annotated[str, OneOf(("all", "refinement"))] = "all"
-
-    @property
-    def rate(self) -> float:
-        return 1e-3 if self.trains == "refinement" else self.learning_rate
-
-    def started(self, prior: Any) -> Any:
-        return deepcopy(prior).with_refinement() if self.trains == "refinement" else prior
 
 
 ENTRY_POINT_GROUP = "scene_envs.algorithms"

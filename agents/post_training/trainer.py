@@ -125,7 +125,6 @@ class PostTrainer:
         self.directory = config.directory
         self.processes = ProcessGroup.current()
         base = cast(ScenePrior, resolve_prior(config.prior if prior is None else prior, config.device))
-        base = config.algorithm.started(base)
         self.device = base.device
         if config.prompt is not None and not base.conditional:
             raise no_text(base.scene_type, str(config.prompt))

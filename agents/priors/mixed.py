@@ -279,21 +279,12 @@ class MixedPrior(ScenePrior):
         return self
 
     def with_refinement(self) -> MixedPrior:
-        """This prior, whose network corrects denoised scenes (:class:`~agents.networks.geometry.Refinement`).
-
-        A new refinement corrects nothing until it is trained; a prior that has one is not changed.
-
-        Raises:
-            InvalidInputError: the assets have no geometry, or the network no contacts.
-        """
+        """This prior with a refinement, see :meth:`ScenePrior.with_refinement`."""
         network = self.denoiser.network
         if self.denoiser.reads_estimate:
             return self
         if not isinstance(network, MixedFlux) or not hasattr(network, "contacts") or not self.scene_type.has_geometry:
-            raise InvalidInputError(
-                "a refinement needs a mixed flux network with contacts, and assets with geometry, and "
-                f"{self.loaded_as or self.scene_type.name!r} lacks one of them; take another prior"
-            )
+            return super().with_refinement()  # raises
         boxes = [self.scene_type.library[name].bounds for name in self.scene_type.assets]  # (2, 3) each
         shapes = [[*(0.5 * (low + high)).tolist(), *(0.5 * (high - low)).tolist()] for low, high in boxes]
         self.denoiser.network = network.refined(shapes).train(network.training)

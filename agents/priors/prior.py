@@ -430,6 +430,19 @@ class ScenePrior(nn.Module, ABC):
         """
         return self
 
+    def with_refinement(self: Prior) -> Prior:
+        """This prior, whose network corrects denoised scenes (:class:`~agents.networks.geometry.Refinement`).
+
+        A new refinement corrects nothing until it is trained; a prior that has one is not changed.
+
+        Raises:
+            InvalidInputError: the assets have no geometry, or the network no contacts.
+        """
+        raise InvalidInputError(
+            "a refinement needs a mixed flux network with contacts, and assets with geometry, and "
+            f"{self.loaded_as or self.scene_type.name!r} lacks one of them; take another prior"
+        )
+
     # -- the reverse chain ------------------------------------------------------------------------
 
     def step_table(self, num_steps: int) -> StepTable:

@@ -106,9 +106,6 @@ class GuidanceDistillation(AveragedSampler):
 
     def __init__(self, settings: GuidanceDistillationSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
         super().__init__(policy, sampler_decay=settings.sampler_decay, warm_up=0.0)
-        if settings.trains == "refinement":
-            self.prior.requires_grad_(False)
-            self.prior.denoiser.network.refinement.requires_grad_(True)
         if not self.prior.scene_type.has_geometry:
             raise InvalidInputError(
                 f"algorithm={settings.name} needs the geometry of the assets, which scene type "
@@ -118,8 +115,6 @@ class GuidanceDistillation(AveragedSampler):
         self.loss = GuidanceDistillationLoss(self.prior)
         self._teacher = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, independent=False)
         table: Any = policy.table
-        self._batch: TensorDictBase | None = None
-        self._known: dict[tuple[int, int], TensorDict] = {}  # corrected states of the batch, by scene and step
         self._stds = [self.sampler.position_std(step, table) for step in range(len(policy))]
         self.steps = [step for step, std in enumerate(self._stds) if PhysicsGuidance.acts(std)]
         if not self.steps:
@@ -159,21 +154,13 @@ class GuidanceDistillation(AveragedSampler):
 
         ``moved`` (B, N) is how far the guidance moves each object, m.
         """
-        if self._batch is not batch:  # the teacher is the same for all updates on a batch
-            self._batch, self._known = batch, {}
-        parts, rows = [], [torch.nonzero(steps == step)[:, 0] for step in self.steps]
-        for step, at in zip(self.steps, rows, strict=True):
-            fresh = [row for row in at.tolist() if (row, step) not in self._known]
-            if fresh:
-                found = self._corrected_at(batch[torch.tensor(fresh, device=batch.device), step], step)
-                self._known.update(zip([(row, step) for row in fresh], found.unbind(0), strict=True))
-            parts += [self._known[row, step] for row in at.tolist()]
-        return torch.stack(parts)[torch.cat(rows).argsort()]
-
-    def end_iteration(self) -> None:
-        """Move the copy towards the prior in training, and forget the corrected states."""
-        super().end_iteration()
-        self._batch, self._known = None, {}
+        rows = [torch.nonzero(steps == step)[:, 0] for step in self.steps]
+        parts = [
+            self._corrected_at(batch[at.to(batch.device), step], step)
+            for step, at in zip(self.steps, rows, strict=True)
+            if len(at)
+        ]
+        return torch.cat(parts)[torch.cat(rows).argsort()]
 
     def _corrected_at(self, states: TensorDictBase, step: int) -> TensorDict:
         """The states [R] of a chain at one step, as the loss reads them."""
