@@ -532,7 +532,7 @@ class MixedFlux(nn.Module):
             InvalidInputError: it has no contacts, or a refinement already.
         """
         added = RefinementConfig(tuple(tuple(shape) for shape in shapes))
-        with torch.random.fork_rng():  # the random state of the caller stays
+        with torch.random.fork_rng(devices=[]):  # the random state of the caller stays
             network = MixedFlux(replace(self.config, modules=(*self.config.modules, added)))
         network = network.to(next(self.parameters()))
         network.load_state_dict(self.state_dict(), strict=False)
