@@ -1,6 +1,6 @@
 """Refinement of a shipped prior: states of its own chains, the corrections of physics guidance, several epochs on both.
 
-    python -m benchmarks.refinement restaurant_low_clutter_feasible runs/refined
+    python benchmarks/refinement.py restaurant_low_clutter_feasible runs/refined
 
 Each round samples chains with the averaged weights, stores their states with the poses to which guidance moves the
 denoised objects, and trains the refinement with the loss of guidance distillation on the states of all rounds. Other
