@@ -46,7 +46,6 @@ def gather(algorithm: GuidanceDistillation, batches: int, seed: int) -> TensorDi
         for step in algorithm.steps:
             rows = torch.full((SCENES,), step)
             parts.append(algorithm.corrected(chains, rows))
-        algorithm.end_iteration()
     return torch.cat(parts)
 
 

@@ -302,10 +302,14 @@ class MixedDenoiser(_Denoiser):
         self.register_buffer("_certain", certain, persistent=False)
         self.register_buffer("_mean", mean, persistent=False)
         self.register_buffer("_std", std, persistent=False)
-        self.reads_estimate = getattr(network.config, "reads_estimate", False)
         self.reads_log_noise = getattr(network.config, "time_input", "timestep") == "log_noise"
         self.text_encoder = text_encoder
         self.categories = categories
+
+    @property
+    def reads_estimate(self) -> bool:
+        """Whether the network reads the denoised scene."""
+        return getattr(self.network.config, "reads_estimate", False)
 
     def groups_by_number(self, text: Text) -> Tensor | None:
         """(B, K) int64 groups of categories by the numbers that ``text`` gives; None if the network has none."""

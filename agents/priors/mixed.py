@@ -288,7 +288,6 @@ class MixedPrior(ScenePrior):
         boxes = [self.scene_type.library[name].bounds for name in self.scene_type.assets]  # (2, 3) each
         shapes = [[*(0.5 * (low + high)).tolist(), *(0.5 * (high - low)).tolist()] for low, high in boxes]
         self.denoiser.network = network.refined(shapes).train(network.training)
-        self.denoiser.reads_estimate = True
         self.config = replace(self.config, network=self.denoiser.network.config)
         return self
 
