@@ -4,7 +4,7 @@
 
 Each round samples chains with the averaged weights, stores their states with the poses to which guidance moves the
 denoised objects, and trains the refinement with the loss of guidance distillation on the states of all rounds. Other
-weights stay as they are.
+weights stay as they are. A prior that has a refinement, such as ``runs/refined/prior``, is trained further.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ def gather(algorithm: GuidanceDistillation, batches: int, seed: int) -> TensorDi
     return torch.cat(parts)
 
 
-def refine(prior: MixedPrior, folder: Path, rounds: int, batches: int, epochs: int, rate: float, clip: float) -> None:
+def refine(
+    prior: MixedPrior, folder: Path, rounds: int, batches: int, epochs: int, rate: float, clip: float, seed: int
+) -> None:
     """Train a refinement of ``prior`` and save it in ``folder``; states that the folder holds are read."""
     prior = prior.with_refinement()
     settings = GuidanceDistillationSettings(clip=clip, sampler_decay=0.0)
@@ -64,7 +66,7 @@ def refine(prior: MixedPrior, folder: Path, rounds: int, batches: int, epochs: i
         path = folder / f"states-{turn}.pt"
         if not path.exists():
             with averaged_weights(prior, average):
-                torch.save(gather(algorithm, batches, seed=100 + 1000 * turn).to_dict(), path)
+                torch.save(gather(algorithm, batches, seed + 1000 * turn).to_dict(), path)
         known = torch.load(path)
         parts.append(TensorDict(known, [len(known["scene"])]))
         states = torch.cat(parts)
@@ -98,7 +100,8 @@ def main() -> None:
     parser.add_argument("--batches", type=int, default=40, help="of 24 chains, in each round")
     parser.add_argument("--epochs", type=int, default=10, help="on all states, in each round")
     parser.add_argument("--rate", type=float, default=1e-3, help="learning rate of AdamW; it falls to a tenth")
-    parser.add_argument("--clip", type=float, default=3.0, help="largest move, in standard deviations of a position")
+    parser.add_argument("--clip", type=float, default=8.0, help="largest move, in standard deviations of a position")
+    parser.add_argument("--seed", type=int, default=100, help="of the chains; the next round adds 1000")
     keys = vars(parser.parse_args())
     prior, folder = cast(MixedPrior, MixedPrior.load(keys.pop("prior"))), keys.pop("output")
     refine(prior, folder, **keys)
