@@ -52,7 +52,7 @@ def gather(algorithm: GuidanceDistillation, batches: int, seed: int) -> TensorDi
 def refine(
     prior: MixedPrior, folder: Path, rounds: int, batches: int, epochs: int, rate: float, clip: float, seed: int
 ) -> None:
-    """Train a refinement of ``prior`` and save it in ``folder``; states that the folder holds are read."""
+    """Train a refinement of ``prior`` and save it in ``folder``; states of the same ``clip`` there are read."""
     prior = prior.with_refinement()
     settings = GuidanceDistillationSettings(clip=clip, sampler_decay=0.0)
     algorithm = GuidanceDistillation(settings, DenoisingPolicy(prior, STEPS), torch.zeros(STEPS))
@@ -63,7 +63,7 @@ def refine(
     folder.mkdir(parents=True, exist_ok=True)
     parts: list[TensorDict] = []
     for turn in range(rounds):
-        path = folder / f"states-{turn}.pt"
+        path = folder / f"states-{turn}-clip-{clip:g}.pt"
         if not path.exists():
             with averaged_weights(prior, average):
                 torch.save(gather(algorithm, batches, seed + 1000 * turn).to_dict(), path)

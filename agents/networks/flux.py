@@ -529,7 +529,7 @@ class MixedFlux(nn.Module):
         :class:`~agents.networks.geometry.RefinementConfig`.
 
         Raises:
-            InvalidInputError: it has no contacts, or a refinement already.
+            InvalidInputError: it has no relations, or a refinement already.
         """
         added = RefinementConfig(tuple(tuple(shape) for shape in shapes))
         with torch.random.fork_rng(devices=[]):  # the random state of the caller stays

@@ -549,7 +549,7 @@ class RefinementConfig(ModuleConfig):
 
     name = "refinement"
     place = "output"
-    requires = ("relations", "contacts")
+    requires = ("relations",)
     reads_geometry = True
     reads_rotations = True
     reads_estimate = True
@@ -596,13 +596,17 @@ class Refinement(FluxModule):
         self.register_buffer("rotations", torch.tensor(core.rotations), persistent=False)
 
     def start_like(self, network: Any) -> None:
-        """Take the weights of a network's relations, contacts, last block and last layers; the correction is then 0."""
+        """Take the weights of a network's relations, contacts if it has them, last block and last layers.
+
+        The correction is then 0.
+        """
         fresh = ("out.", "gates.", "touch.2.")  # these are 0 at the start
         parts: list[tuple[nn.Module, Any]] = [
-            (self.near, network.relations), (self.touching, network.contacts), (self.block, network.single_blocks[-1]),
-            (self.final, network.final), (self.final_modulation, network.final_modulation),
-            (self.pose_out[0], network.pose_out[0]),
+            (self.near, network.relations), (self.block, network.single_blocks[-1]), (self.final, network.final),
+            (self.final_modulation, network.final_modulation), (self.pose_out[0], network.pose_out[0]),
         ]  # fmt: skip
+        if hasattr(network, "contacts"):
+            parts.append((self.touching, network.contacts))
         for own, trained in parts:
             weights = trained.state_dict()
             own.load_state_dict({k: v for k, v in weights.items() if not k.startswith(fresh)}, strict=False)

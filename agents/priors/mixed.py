@@ -283,7 +283,7 @@ class MixedPrior(ScenePrior):
         network = self.denoiser.network
         if self.denoiser.reads_estimate:
             return self
-        if not isinstance(network, MixedFlux) or not hasattr(network, "contacts") or not self.scene_type.has_geometry:
+        if not isinstance(network, MixedFlux) or not hasattr(network, "relations") or not self.scene_type.has_geometry:
             return super().with_refinement()  # raises
         boxes = [self.scene_type.library[name].bounds for name in self.scene_type.assets]  # (2, 3) each
         shapes = [[*(0.5 * (low + high)).tolist(), *(0.5 * (high - low)).tolist()] for low, high in boxes]

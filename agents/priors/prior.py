@@ -436,10 +436,10 @@ class ScenePrior(nn.Module, ABC):
         A new refinement corrects nothing until it is trained; a prior that has one is not changed.
 
         Raises:
-            InvalidInputError: the assets have no geometry, or the network no contacts.
+            InvalidInputError: the assets have no geometry, or the network no relations.
         """
         raise InvalidInputError(
-            "a refinement needs a mixed flux network with contacts, and assets with geometry, and "
+            "a refinement needs a mixed flux network with relations, and assets with geometry, and "
             f"{self.loaded_as or self.scene_type.name!r} lacks one of them; take another prior"
         )
 

@@ -133,11 +133,11 @@ def test_slots_are_a_set_and_padding_changes_nothing() -> None:
     torch.testing.assert_close(refined(**padded, slot_mask=mask)[0][:, :5], output)
 
 
-@pytest.fixture
-def prior() -> MixedPrior:
+@pytest.fixture(params=[MODULES, MODULES[:1]], ids=["contacts", "relations"])
+def prior(request: pytest.FixtureRequest) -> MixedPrior:
     tiny = tiny_prior("dimsum_table", process="mixed")
     assert isinstance(tiny, MixedPrior)
-    wide = replace(tiny.config.network, modules=(*tiny.config.network.modules, *MODULES))
+    wide = replace(tiny.config.network, modules=(*tiny.config.network.modules, *request.param))
     torch.manual_seed(0)
     return MixedPrior(replace(tiny.config, network=wide), tiny.normalizer, tiny.preconditioning)
 
@@ -169,7 +169,7 @@ def test_a_timestep_of_all_scenes_and_one_of_each_denoise_alike(prior: MixedPrio
 
 
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
-def test_a_prior_without_contacts_is_refused(process: str) -> None:
+def test_a_prior_without_relations_is_refused(process: str) -> None:
     tiny = tiny_prior("dimsum_table", process=process)
-    with pytest.raises(InvalidInputError, match="needs a mixed flux network with contacts"):
+    with pytest.raises(InvalidInputError, match="needs a mixed flux network with relations"):
         tiny.with_refinement()
