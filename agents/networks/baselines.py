@@ -168,9 +168,6 @@ class MixedBaseline(_Baseline):
         return self.pose_out(tokens), self.logits_out(tokens)
 
 
-# -- MiDiffusion ----------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class _MiDiffusionSize(BaselineConfig):
     depth: int = 6
@@ -243,9 +240,6 @@ class _Transformer(nn.Module):
         for block in self.blocks:
             tokens = block(tokens, condition, text, padding)
         return tokens
-
-
-# -- DiffuScene -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -361,9 +355,6 @@ class _UNet(nn.Module):
                 x = self.to_fine[index - 1](x.repeat_interleave(2, dim=-1)[..., : skip.shape[-1]])
             x = level(torch.cat([x, skip], dim=1), condition, text, padding)
         return x.transpose(1, 2)
-
-
-# -- registration ---------------------------------------------------------------------------------
 
 
 def _diffuscene(keys: Mapping[str, Any]) -> dict[str, Any]:

@@ -45,8 +45,6 @@ from agents.networks.registry import register_network
 from scene_envs.errors import InvalidInputError, unknown_name
 from scene_envs.scene import POSE_FEATURES
 
-# -- blocks ---------------------------------------------------------------------------------------
-
 
 class _Gelu(torch.autograd.Function):
     """GELU with tanh, written out: on a CPU this takes half of the time of the function of torch."""
@@ -191,9 +189,6 @@ class _Stream(nn.Module):
         x = torch.addcmul(x, rates[2], self.out(attended))
         inner = ((1 + rates[4]) * F.layer_norm(x, (self.hidden,), eps=1e-6)).add_(rates[3])
         return torch.addcmul(x, rates[5], self.mlp[2](gelu(self.mlp[0](inner))))
-
-
-# -- continuous scenes ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -533,6 +528,7 @@ class MixedFlux(nn.Module):
         """
         added = RefinementConfig(tuple(tuple(shape) for shape in shapes))
         with torch.random.fork_rng(devices=[]):  # the random state of the caller stays
+            torch.manual_seed(0)  # the same start in every process
             network = MixedFlux(replace(self.config, modules=(*self.config.modules, added)))
         network = network.to(next(self.parameters()))
         network.load_state_dict(self.state_dict(), strict=False)
@@ -665,9 +661,6 @@ def _mask(
     words = everywhere[:, :count] if text_mask is None or not count else text_mask
     present = everywhere[:, count:] if slot_mask is None else slot_mask
     return torch.cat([words, present], dim=1)[:, None, None]
-
-
-# -- registration ---------------------------------------------------------------------------------
 
 
 def _continuous_sizes(keys: Mapping[str, Any]) -> dict[str, Any]:

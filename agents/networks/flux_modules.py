@@ -165,9 +165,6 @@ class ModuleConfig(ABC):
         """The module with fresh weights, for a network with the configuration ``core``."""
 
 
-# -- observed entries -----------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class ObservedFlagsConfig(ModuleConfig):
     """An embedding of which entries of a slot are observed."""
@@ -191,9 +188,6 @@ class ObservedFlags(FluxModule):
         return None if scene.observed is None else self.embedding(scene.observed)
 
 
-# -- text -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class PooledTextConfig(ModuleConfig):
     """The mean of the text tokens, which then modulates every block."""
@@ -215,9 +209,6 @@ class PooledText(FluxModule):
 
     def condition(self, scene: Scene) -> Tensor | None:
         return None if scene.summary is None else self.linear(scene.summary)
-
-
-# -- counts ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -414,9 +405,6 @@ def still_to_come(logits: Tensor, visible: Tensor) -> Tensor:
     weight = probability * (beyond >= 0)
     least = torch.where(probability[..., 1:].amax(dim=-1) >= _KNOWN, _MIN_REST, _TINY)
     return (weight * beyond).sum(dim=-1) / weight.sum(dim=-1).maximum(least)
-
-
-# -- translations ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -291,9 +291,6 @@ class BertEncoder(nn.Module):
         return self
 
 
-# -- choice ---------------------------------------------------------------------------------------
-
-
 VOCABULARY = "vocabulary"
 """The key of the small encoder with a closed vocabulary, trained with the prior."""
 

@@ -170,7 +170,8 @@ def add_regularisation_gradient(
             text = None if prompts is None else prior.encode_prompts(prompts[rows])
         mean = losses(noised.rows(rows), text).mean() * ((part.stop - part.start) / len(x0))
         value += float(mean.detach())
-        (coefficient * mean).backward()
+        if mean.requires_grad:  # not where all scenes are too noisy for a refinement that is trained alone
+            (coefficient * mean).backward()
     processes.sum_gradients(parameters)
     norm = gradient_norm(parameters)
     for parameter, gradient in zip(parameters, before, strict=True):

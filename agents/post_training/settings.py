@@ -174,7 +174,8 @@ class GuidanceDistillationSettings(AlgorithmSettings):
 
     Attributes:
         updates: optimiser steps per batch.
-        draws: number of steps of the chain of every scene per optimiser step.
+        states: number of states per optimiser step.
+        memory: number of latest states, over all processes, from which they are drawn.
         strength: strength of the physics guidance that is learned, 0 to 1.
         clip: largest move of an object that is learned at a step, in standard deviations of its denoised position.
         sampler_decay: decay of the averaged weights that sample, per iteration.
@@ -186,10 +187,26 @@ class GuidanceDistillationSettings(AlgorithmSettings):
 
     name: str = "guidance_distillation"
     updates: Count = 4
-    draws: Count = 2
+    states: Count = 96
+    memory: Count = 600
     strength: Annotated[float, Limit(lambda value: 0 < value <= 1, "must lie in (0, 1]; 1 learns whole moves")] = 1.0
     clip: Unlimited = 1.0
     sampler_decay: Annotated[float, BELOW_ONE] = 0.9
+
+
+@dataclass
+class RefinementSettings(GuidanceDistillationSettings):
+    """Guidance distillation of a refinement: one more block corrects what the prior denoises; all else is frozen."""
+
+    learning_rate: ClassVar[float] = 1e-3
+    regularisation_weight: ClassVar[float] = 0.0
+
+    name: str = "refinement"
+    updates: Count = 40
+    states: Count = 64
+    memory: Count = 20_000
+    clip: Unlimited = 16.0
+    sampler_decay: Annotated[float, BELOW_ONE] = 0.6
 
 
 ENTRY_POINT_GROUP = "scene_envs.algorithms"
@@ -202,16 +219,15 @@ MEAN_REWARDS = ("clearance", "discriminator", "feasible_share", "reachability", 
 
 
 _FOLDER = "agents.post_training.algorithms"
+_DISTILLATION = f"{_FOLDER}.guidance_distillation"
 _ALGORITHMS: Registry[tuple[type[AlgorithmSettings], Any]] = Registry(
     "algorithm",
     ENTRY_POINT_GROUP,
     {
         "ddpo_sf": (DDPOSFSettings, f"{_FOLDER}.ddpo:DDPO"),
         "ddpo_is": (DDPOISSettings, f"{_FOLDER}.ddpo:DDPO"),
-        "guidance_distillation": (
-            GuidanceDistillationSettings,
-            f"{_FOLDER}.guidance_distillation:GuidanceDistillation",
-        ),
+        "guidance_distillation": (GuidanceDistillationSettings, f"{_DISTILLATION}:GuidanceDistillation"),
+        "refinement": (RefinementSettings, f"{_DISTILLATION}:GuidanceDistillation"),
         "nft": (NFTSettings, f"{_FOLDER}.forward_process:ForwardProcess"),
         "awm": (AWMSettings, f"{_FOLDER}.forward_process:ForwardProcess"),
     },

@@ -32,9 +32,6 @@ from scene_envs.physics.correction import corrections
 from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
-# -- hooks ----------------------------------------------------------------------------------------
-
-
 Hook = Callable[[int, Tensor, ReverseStep], ReverseStep]
 """``(step, x_t, reverse) -> reverse``: called at every step before x_{t-1} is drawn; may change the rows of
 ``reverse`` or shift it.
@@ -46,9 +43,6 @@ Guide = Callable[[int, int, Callable[[], SceneBatch], Tensor], Tensor | None]
 denoised translations, m, on their device. If the shift is None, the step is not changed. If a guide has a method
 ``acts(std)``, it is called only at the steps at which the method, which gets ``std`` on the CPU, returns True.
 """
-
-
-# -- physics --------------------------------------------------------------------------------------
 
 
 _FINE = 0.03
@@ -98,9 +92,6 @@ class PhysicsGuidance:
     def acts(std: Tensor) -> bool:
         """Whether objects are moved at steps whose denoised positions have the standard deviation ``std`` (3,), m."""
         return float(std[:2].max()) <= _FINE
-
-
-# -- numbers --------------------------------------------------------------------------------------
 
 
 _ROUNDS = 50

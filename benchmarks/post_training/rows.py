@@ -113,7 +113,7 @@ def _losses(iterations: int, *keys: str) -> tuple[Row, ...]:
         for seed in range(seeds)
         for reward in ("feasible_share", "object_count")
         for name, algorithm, more in (
-            *((name, name, ()) for name in (FORWARD, "awm", CHAIN, "ddpo_is", DISTILLATION, *PLUG_INS)),
+            *((name, name, ()) for name in (FORWARD, "awm", CHAIN, "ddpo_is", DISTILLATION, "refinement", *PLUG_INS)),
             ("udm_grpo_averaged", "udm_grpo", ("algorithm.sampler_decay=0.99", learned)),
             ("crd_averaged", "crd", (learned,)),
         )

@@ -16,6 +16,7 @@ ALGORITHMS = {
     "nft": "nft",
     "awm": "awm",
     "guidance_distillation": "guidance_distillation",
+    "refinement": "refinement",
 }
 """Algorithm of each page below ``docs/algorithms``."""
 PAGES = {**{f"docs/algorithms/{page}.md": name for page, name in ALGORITHMS.items()}, "docs/guard.md": "nft"}

@@ -12,9 +12,10 @@ import torch
 from torch import multiprocessing
 from torch.nn.modules.module import register_module_forward_pre_hook
 
+from agents.networks.geometry import RelationsConfig
 from agents.post_training import PostTrainConfig, post_train
 from agents.priors.testing import tiny_prior
-from tests.helpers.small_runs import one_quick_classifier, scenes_drawn_once
+from tests.helpers.small_runs import one_quick_classifier, scenes_drawn_once, with_modules
 
 Run = tuple[PostTrainConfig, str, torch.dtype]
 """A configuration, the process of its prior (``continuous`` or ``mixed``), and the dtype of everything."""
@@ -31,7 +32,10 @@ def train(runs: Iterable[Run]) -> None:
         hook = register_module_forward_pre_hook(lambda module, inputs: tuple(map(_as_default, inputs)))
         try:
             with patch("matplotlib.figure.Figure.savefig"), one_quick_classifier(), scenes_drawn_once():
-                post_train(config, prior=tiny_prior(process=process, text=config.prompt is not None).to(dtype))
+                prior = tiny_prior(process=process, text=config.prompt is not None)
+                if config.algorithm.name == "refinement":
+                    prior = with_modules(prior, RelationsConfig())
+                post_train(config, prior=prior.to(dtype))
         finally:
             hook.remove()
             torch.set_default_dtype(before)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ import torch
 from agents.configuration.composition import changed
 from agents.evaluation import classifier
 from agents.evaluation.classifier import ClassifierConfig
+from agents.networks.flux_modules import ModuleConfig
 from agents.post_training import PostTrainConfig
 from agents.post_training import real_scenes as scene_bank
+from agents.priors.mixed import MixedPrior
 from agents.priors.prior import ScenePrior
 from rewards.base import RewardContext, RewardOutput
 from scene_envs.scene import SceneBatch
@@ -91,3 +94,11 @@ def scenes_drawn_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_bank, "real_scenes", once)
         yield
+
+
+def with_modules(prior: ScenePrior, *modules: ModuleConfig) -> MixedPrior:
+    """An untrained mixed prior like this one, whose network has further modules."""
+    assert isinstance(prior, MixedPrior)
+    network = replace(prior.config.network, modules=(*prior.config.network.modules, *modules))
+    torch.manual_seed(0)
+    return MixedPrior(replace(prior.config, network=network), prior.normalizer, prior.preconditioning)

@@ -17,6 +17,7 @@ from agents.priors.mixed import MixedPrior
 from agents.priors.prior import ScenePrior
 from agents.priors.testing import tiny_prior
 from scene_envs.errors import InvalidInputError
+from tests.helpers.small_runs import with_modules
 
 SHAPES = ((0.0, 0.0, 0.1, 0.2, 0.1, 0.1), (0.0, 0.05, 0.0, 0.1, 0.1, 0.3), (0.0, 0.0, 0.0, 0.3, 0.3, 0.1))
 MODULES = (RelationsConfig(), ContactsConfig())
@@ -135,11 +136,7 @@ def test_slots_are_a_set_and_padding_changes_nothing() -> None:
 
 @pytest.fixture(params=[MODULES, MODULES[:1]], ids=["contacts", "relations"])
 def prior(request: pytest.FixtureRequest) -> MixedPrior:
-    tiny = tiny_prior("dimsum_table", process="mixed")
-    assert isinstance(tiny, MixedPrior)
-    wide = replace(tiny.config.network, modules=(*tiny.config.network.modules, *request.param))
-    torch.manual_seed(0)
-    return MixedPrior(replace(tiny.config, network=wide), tiny.normalizer, tiny.preconditioning)
+    return with_modules(tiny_prior("dimsum_table", process="mixed"), *request.param)
 
 
 def test_a_prior_gets_a_refinement_that_is_saved_with_it(prior: MixedPrior, tmp_path: Path) -> None:

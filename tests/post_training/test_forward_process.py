@@ -271,7 +271,7 @@ def forward_config(
 def test_stopped_and_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, algorithm: str, process: str) -> None:
     settings, slots = {}, None
     if algorithm == "guidance_distillation":  # scenes of an untrained prior have many overlaps
-        settings, slots = {"updates": 1, "draws": 1}, 8
+        settings, slots = {"updates": 1, "states": 6}, 8
 
     def run(folder: str, iterations: int) -> PostTrainResult:
         guard = {"scenes": 8, "every": 1}

@@ -76,7 +76,7 @@ def test_targets_are_the_corrections_of_what_the_sampler_denoises(trainer: PostT
     learner, found = algorithm(trainer), trainer.learner.rollout(0)
     learner.settings.clip = 1e9
     step, prior, table = learner.steps[-3], learner.sampler, trainer.learner.policy.table
-    states = learner.corrected(found, torch.full((len(found),), step))
+    states = learner.corrected(found, step)
     torch.testing.assert_close(states["scene"], found["scene"][:, step])
     with torch.no_grad():
         reverse: Any = prior.transition(found["scene"][:, step], step, table)
@@ -94,11 +94,10 @@ def test_targets_are_the_corrections_of_what_the_sampler_denoises(trainer: PostT
 def test_no_target_is_further_than_the_clip(trainer: PostTrainer) -> None:
     learner, found = algorithm(trainer), trainer.learner.rollout(0)
     for step in (learner.steps[0], learner.steps[-1]):
-        at = torch.full((len(found),), step)
         learner.settings.clip = 0.5
-        near = learner.corrected(found, at)["denoised"]
+        near = learner.corrected(found, step)["denoised"]
         learner.settings.clip = 1e-9
-        own = learner.corrected(found, at)["denoised"]
+        own = learner.corrected(found, step)["denoised"]
         scale = learner.sampler.normalizer.scale[TRANSLATION]
         std = learner.sampler.position_std(step, trainer.learner.policy.table)  # type: ignore[arg-type]
         far = ((near - own)[..., TRANSLATION] / scale / std).norm(dim=-1)
@@ -108,7 +107,7 @@ def test_no_target_is_further_than_the_clip(trainer: PostTrainer) -> None:
 def test_the_prior_comes_nearer_to_guided_samples(trainer: PostTrainer) -> None:
     """Eight updates on the states of one batch lower their loss."""
     learner, found = trainer.learner, trainer.learner.rollout(0)
-    states = learner.algorithm.corrected(found, torch.full((6,), learner.algorithm.steps[2]))  # type: ignore[attr-defined]
+    states = learner.algorithm.corrected(found, learner.algorithm.steps[2])  # type: ignore[attr-defined]
     loss = GuidanceDistillationLoss(learner.prior)
     before = float(loss(states)["loss_objective"].detach())
     optimizer = torch.optim.AdamW(learner.parameters, lr=2e-5)
@@ -126,7 +125,9 @@ def test_a_prior_that_knows_no_position_is_refused(tmp_path: Path, monkeypatch: 
         PostTrainer(small_config(tmp_path, num_steps=STEPS, algorithm={"name": NAME}), prior=prior)
 
 
-@pytest.mark.parametrize("keys", [{"clip": 0.0}, {"draws": 0}, {"sampler_decay": 1.0}, {"strength": 2.0}])
+@pytest.mark.parametrize(
+    "keys", [{"clip": 0.0}, {"states": 0}, {"memory": 0}, {"sampler_decay": 1.0}, {"strength": 2.0}]
+)
 def test_values_that_cannot_be_are_named(tmp_path: Path, keys: dict[str, Any]) -> None:
     with pytest.raises(InvalidInputError, match=next(iter(keys))):
         small_config(tmp_path, algorithm={"name": NAME, **keys})

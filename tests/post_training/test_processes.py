@@ -61,7 +61,12 @@ CASES: dict[str, tuple[str, torch.dtype, dict[str, Any]]] = {
     "guidance_distillation": (
         "mixed",
         torch.float64,
-        {"algorithm": {"updates": 1, "draws": 1}, "prompt": TWO, "iterations": 1, "slots": 12},
+        {"algorithm": {"updates": 1, "states": 6}, "prompt": TWO, "iterations": 1, "slots": 12},
+    ),
+    "refinement": (
+        "mixed",
+        torch.float64,
+        {"algorithm": {"updates": 2, "states": 6}, "iterations": 1, "slots": 12},
     ),
 }
 """Algorithm: the process of the prior, the dtype, and further keys."""

@@ -190,7 +190,7 @@ def test_doctor_says_when_no_advantage_differs(tmp_path: Path) -> None:
 
 
 def test_doctor_asks_nothing_of_the_reward_of_an_algorithm_that_does_not_use_it(tmp_path: Path) -> None:
-    algorithm = {"name": "guidance_distillation", "draws": 1}
+    algorithm = {"name": "guidance_distillation", "states": 8}
     config = small_config(
         tmp_path / "run", algorithm=algorithm, reward=lambda batch: RewardOutput(torch.ones(len(batch)))
     )

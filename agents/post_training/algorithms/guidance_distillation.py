@@ -8,13 +8,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
+from agents.networks.geometry import RefinementConfig
 from agents.post_training.algorithms.base import AveragedSampler, BatchGradient, PlainLoss, accepted_keys, in_parts
 from agents.post_training.policy import DenoisingPolicy
 from agents.post_training.rollouts import text_of
-from agents.post_training.settings import GuidanceDistillationSettings
+from agents.post_training.settings import GuidanceDistillationSettings, RefinementSettings
 from agents.priors.guidance import PhysicsGuidance
 from agents.priors.prior import NoisedScenes, ScenePrior
-from agents.utils.process_group import ProcessGroup
+from agents.utils.process_group import ProcessGroup, gather_rows
 from scene_envs.errors import InvalidInputError
 from scene_envs.scene import POSE_FEATURES, TRANSLATION
 
@@ -86,31 +87,39 @@ class GuidanceDistillationLoss(PlainLoss):
 
 
 class GuidanceDistillation(AveragedSampler):
-    """On-policy distillation of physics guidance.
+    """On-policy distillation of physics guidance, into all weights or into a refinement alone.
 
-    The sampling policy, a slower copy of the prior, samples a batch of scenes without physics guidance. At random steps
-    of these chains, :class:`~agents.priors.guidance.PhysicsGuidance` corrects the scenes that the copy
-    denoises, and the prior is trained to denoise the same x_t to the corrected poses. The states come from the policy
-    itself, as in DAgger (Ross et al. 2011), so the prior learns to correct its own errors. The gradient vanishes where
-    the guidance has nothing to correct. Rotations are held at those that the copy denoises, and categories get no
-    gradient. The reward is only reported.
+    The sampling policy, a slower copy of the prior, samples a batch of scenes without physics guidance. At the steps of
+    these chains at which :class:`~agents.priors.guidance.PhysicsGuidance` acts, it corrects the scenes that the copy
+    denoises, and the prior is trained to denoise the same x_t to the corrected poses. Every optimiser step draws from
+    the latest ``settings.memory`` of these states, which come from the policy itself, as in DAgger (Ross et al. 2011):
+    the prior learns to correct its own errors. The gradient vanishes where the guidance has nothing to correct.
+    Rotations are held at those that the copy denoises, and categories get no gradient. The reward is only reported.
+
+    With the settings of ``refinement``, a prior without a :class:`~agents.networks.geometry.Refinement` gets one, and
+    all other weights are frozen.
 
     Attributes:
         steps: steps of the chain of ``policy`` at which the guidance moves objects; the sigmas ``stds`` are not used.
 
     Raises:
-        InvalidInputError: the guidance acts at no step of the chain, or the assets have no geometry.
+        InvalidInputError: the guidance acts at no step of the chain, the assets have no geometry, or the prior can have
+            no refinement.
     """
 
     loss: GuidanceDistillationLoss
 
     def __init__(self, settings: GuidanceDistillationSettings, policy: DenoisingPolicy, stds: Tensor) -> None:
-        super().__init__(policy, sampler_decay=settings.sampler_decay, warm_up=0.0)
-        if not self.prior.scene_type.has_geometry:
+        prior: Any = policy.prior
+        if not prior.scene_type.has_geometry:
             raise InvalidInputError(
                 f"algorithm={settings.name} needs the geometry of the assets, which scene type "
-                f"{self.prior.scene_type.name!r} does not have; take another algorithm, such as nft"
+                f"{prior.scene_type.name!r} does not have; take another algorithm, such as nft"
             )
+        if isinstance(settings, RefinementSettings):
+            network = prior.with_refinement().requires_grad_(False).denoiser.network
+            network.get_submodule(RefinementConfig.name).requires_grad_(True)
+        super().__init__(policy, sampler_decay=settings.sampler_decay, warm_up=0.0)
         self.settings = settings
         self.loss = GuidanceDistillationLoss(self.prior)
         self._teacher = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, independent=False)
@@ -124,46 +133,61 @@ class GuidanceDistillation(AveragedSampler):
                 f"known to 3 cm, and the error of this prior is {error:.0f} mm at the last of num_steps={len(policy)} "
                 "steps; pretrain the prior for longer"
             )
+        self._states: TensorDict | None = None  # of all processes, the same in each
+        self._kept = False  # whether they include those of the present batch
 
     def accumulate(self, batch: TensorDictBase, generator: Generator) -> BatchGradient:
-        """Add the gradient of a batch to ``.grad``: ``draws`` random steps of the chain of every scene.
+        """Add the gradient of ``settings.states`` states; those of a new batch are corrected and kept first.
 
-        With several processes, ``.grad`` gets the part of this process's scenes in the mean over all scenes.
+        With several processes, ``.grad`` gets this process's part of these states.
         """
-        processes, own = ProcessGroup.current(), len(batch)
-        count, draws = processes.size * own, self.settings.draws
-        chosen = [
-            torch.tensor(self.steps)[torch.randint(len(self.steps), (count,), generator=generator)]
-            for _ in range(draws)
-        ]
-        states = [self.corrected(batch, steps[processes.rows(count)]) for steps in chosen]
-        total = 0.0
-        for rows in in_parts(self.prior.parameters(), own, self.policy.chunk):
-            for state in states:
-                part = state[rows]
-                objective = self.loss(part)["loss_objective"] * (len(part) / count / draws)
+        if not self._kept:
+            self._states, self._kept = self._with(batch), True
+        assert self._states is not None
+        processes, count = ProcessGroup.current(), self.settings.states
+        drawn = torch.randint(len(self._states), (count,), generator=generator)[processes.rows(count)]
+        states, total = self._states[drawn].to(batch.device), 0.0
+        for rows in in_parts(self.prior.parameters(), len(states), self.policy.chunk):
+            objective = self.loss(states[rows])["loss_objective"] * (len(states[rows]) / count)
+            if objective.requires_grad:  # not where a refinement acts on none of the states
                 objective.backward()
-                total += float(objective.detach())
-        moved, objects = (float(sum(state[name].sum() for state in states)) for name in ("moved", "trained"))
+            total += float(objective.detach())
+        moved, objects = (float(states[name].sum()) for name in ("moved", "trained"))
         total, moved, objects = processes.sum_numbers(total, moved, objects)
         return BatchGradient(total, {"correction_mm": 1e3 * moved / max(1.0, objects)})
 
+    def _with(self, batch: TensorDictBase) -> TensorDict:
+        """The latest states, with those of a batch of all processes: scene by scene, at all steps."""
+        parts = [self.corrected(batch, step) for step in self.steps]
+        columns = {name: torch.stack([part[name] for part in parts], dim=1) for name in parts[0].keys()}  # noqa: SIM118
+        states = {name: gather_rows(column).cpu().flatten(0, 1) for name, column in columns.items()}
+        if self._states is not None:
+            states = {name: torch.cat([self._states[name], column]) for name, column in states.items()}
+        latest = {name: column[-self.settings.memory :] for name, column in states.items()}
+        return TensorDict(latest, [len(latest["scene"])])
+
+    def end_iteration(self) -> None:
+        """Move the copy that samples towards the prior in training."""
+        super().end_iteration()
+        self._kept = False
+
+    def state(self) -> dict[str, Any]:
+        """The averaged weights, and the states that are kept."""
+        return {**super().state(), "states": None if self._states is None else self._states.to_dict()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state`."""
+        super().restore(state)
+        states = state["states"]
+        self._states = None if states is None else TensorDict(states, [len(states["scene"])])
+
     @torch.no_grad()
-    def corrected(self, batch: TensorDictBase, steps: Tensor) -> TensorDict:
-        """The states (B,) of scenes at ``steps`` (B,) of their chains, all in :attr:`steps`, as the loss reads them.
+    def corrected(self, batch: TensorDictBase, step: int) -> TensorDict:
+        """The states (B,) of chains at ``step``, one of :attr:`steps`, as the loss reads them.
 
         ``moved`` (B, N) is how far the guidance moves each object, m.
         """
-        rows = [torch.nonzero(steps == step)[:, 0] for step in self.steps]
-        parts = [
-            self._corrected_at(batch[at.to(batch.device), step], step)
-            for step, at in zip(self.steps, rows, strict=True)
-            if len(at)
-        ]
-        return torch.cat(parts)[torch.cat(rows).argsort()]
-
-    def _corrected_at(self, states: TensorDictBase, step: int) -> TensorDict:
-        """The states [R] of a chain at one step, as the loss reads them."""
+        states = batch[:, step]
         x, text = states["scene"], text_of(states)
         denoised = self._teacher.distribution(x, step, text).denoised
         assert denoised is not None
