@@ -97,7 +97,7 @@ def test_the_card_of_a_sum_names_its_runs(tmp_path: Path) -> None:
 def test_half_of_a_shipped_prior_is_the_mean_with_its_base() -> None:
     merged, base, other = (
         ScenePrior.load(name).weights()
-        for name in ("dimsum_table with 0.5*dimsum_table_feasible", "dimsum_table", "dimsum_table_feasible")
+        for name in ("pantry_shelf with 0.5*pantry_shelf_feasible", "pantry_shelf", "pantry_shelf_feasible")
     )
     for name, found in merged.items():
         torch.testing.assert_close(found, (base[name] + other[name]) / 2, rtol=1e-5, atol=1e-6)
