@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import json
 import re
 from pathlib import Path
@@ -15,8 +16,8 @@ import torch
 from PIL import Image
 from rich.console import Console
 
+from agents.post_training import doctor, post_train_and_compare
 from agents.post_training import learner as learned_rewards
-from agents.post_training import post_train_and_compare
 from agents.post_training.demo import run_demo
 from agents.post_training.doctor import diagnose
 from agents.post_training.report import load_learned_rewards, measure_prior, write_report
@@ -197,3 +198,12 @@ def test_doctor_asks_nothing_of_the_reward_of_an_algorithm_that_does_not_use_it(
     report = diagnose(config, prior=tiny_prior(process="mixed", slots=8))
     assert report.reward_std == 0
     assert not any("nothing to learn" in line for line in report.advice)
+
+
+def test_the_length_of_a_run_counts_all_updates_of_a_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a clock that goes on by one second whenever it is read, a batch takes one, and each of five updates one."""
+    seconds = itertools.count(0.0)
+    monkeypatch.setattr(doctor, "time", SimpleNamespace(perf_counter=lambda: next(seconds)))
+    keys = {"algorithm": {"name": "nft", "updates": 5}, "iterations": 10}
+    report = diagnose(small_config(tmp_path / "run", **keys), prior=tiny_prior(process="mixed"))
+    assert (report.sampling_seconds, report.update_seconds) == (1.0, 5.0)
