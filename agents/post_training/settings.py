@@ -177,7 +177,7 @@ class GuidanceDistillationSettings(AlgorithmSettings):
         states: number of states per optimiser step.
         memory: number of latest states, over all processes, from which they are drawn.
         strength: strength of the physics guidance that is learned, 0 to 1.
-        clip: largest move of an object that is learned at a step, in standard deviations of its denoised position.
+        huber: error of an entry, in standard deviations, from which on its loss is linear.
         sampler_decay: decay of the averaged weights that sample, per iteration.
     """
 
@@ -190,7 +190,7 @@ class GuidanceDistillationSettings(AlgorithmSettings):
     states: Count = 96
     memory: Count = 600
     strength: Annotated[float, Limit(lambda value: 0 < value <= 1, "must lie in (0, 1]; 1 learns whole moves")] = 1.0
-    clip: Unlimited = 1.0
+    huber: Unlimited = 1.0
     sampler_decay: Annotated[float, BELOW_ONE] = 0.9
 
 
@@ -205,7 +205,6 @@ class RefinementSettings(GuidanceDistillationSettings):
     updates: Count = 40
     states: Count = 64
     memory: Count = 20_000
-    clip: Unlimited = 16.0
     sampler_decay: Annotated[float, BELOW_ONE] = 0.6
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,13 @@ def test_a_prior_that_denoises_as_the_teacher_has_no_loss(name: str) -> None:
         assert float(GuidanceDistillationLoss(prior)(TensorDict(states, [2]))["loss_objective"]) < 1e-6
 
 
-@pytest.mark.parametrize("process", ["mixed", "continuous"])
-def test_the_loss_is_the_squared_difference_in_units_of_the_denoiser_error(process: str) -> None:
+@pytest.mark.parametrize(
+    ("process", "huber", "error", "expected"),
+    [("mixed", math.inf, 0.7, 0.49), ("continuous", math.inf, 0.7, 0.49), ("mixed", 0.5, 2.5, 0.5 * (2 * 2.5 - 0.5))],
+)
+def test_the_loss_is_the_squared_difference_in_units_of_the_denoiser_error_and_linear_above_the_limit(
+    process: str, huber: float, error: float, expected: float
+) -> None:
     prior = tiny_prior(process=process)
     table, generator = prior.step_table(10), Generator().manual_seed(0)
     x, step = prior.initial(3, 34, generator), 6
@@ -62,19 +68,18 @@ def test_the_loss_is_the_squared_difference_in_units_of_the_denoiser_error(proce
     denoised: Any = prior.transition(x, step, table)
     own = denoised.denoised[..., :POSE_FEATURES]
     _, std = prior.process.estimate(t, int(table.previous[step]), prior.residual)
-    moved = 0.7 * std[:POSE_FEATURES].float()  # 0.7 standard deviations along every entry
+    moved = error * std[:POSE_FEATURES].float()
     trained = torch.zeros(3, 34, dtype=torch.bool)
     trained[:, 4:9] = True
     states = {"scene": x, "timestep": torch.full((3, 1), t), "denoised": own + moved, "trained": trained}
-    found = GuidanceDistillationLoss(prior)(TensorDict(states, [3]))["loss_objective"]
-    assert float(found) == pytest.approx(0.49, rel=1e-3)
+    found = GuidanceDistillationLoss(prior, huber)(TensorDict(states, [3]))["loss_objective"]
+    assert float(found) == pytest.approx(expected, rel=1e-3)
     found.backward()
     assert any(p.grad is not None and bool(p.grad.any()) for p in prior.parameters())
 
 
 def test_targets_are_the_corrections_of_what_the_sampler_denoises(trainer: PostTrainer) -> None:
     learner, found = algorithm(trainer), trainer.learner.rollout(0)
-    learner.settings.clip = 1e9
     step, prior, table = learner.steps[-3], learner.sampler, trainer.learner.policy.table
     states = learner.corrected(found, step)
     torch.testing.assert_close(states["scene"], found["scene"][:, step])
@@ -91,31 +96,18 @@ def test_targets_are_the_corrections_of_what_the_sampler_denoises(trainer: PostT
     assert (states["trained"].sum(dim=1) > 0).all()
 
 
-def test_no_target_is_further_than_the_clip(trainer: PostTrainer) -> None:
-    learner, found = algorithm(trainer), trainer.learner.rollout(0)
-    for step in (learner.steps[0], learner.steps[-1]):
-        learner.settings.clip = 0.5
-        near = learner.corrected(found, step)["denoised"]
-        learner.settings.clip = 1e-9
-        own = learner.corrected(found, step)["denoised"]
-        scale = learner.sampler.normalizer.scale[TRANSLATION]
-        std = learner.sampler.position_std(step, trainer.learner.policy.table)  # type: ignore[arg-type]
-        far = ((near - own)[..., TRANSLATION] / scale / std).norm(dim=-1)
-        assert float(far.max()) <= 0.5 + 1e-3
-
-
 def test_the_prior_comes_nearer_to_guided_samples(trainer: PostTrainer) -> None:
     """Eight updates on the states of one batch lower their loss."""
     learner, found = trainer.learner, trainer.learner.rollout(0)
     states = learner.algorithm.corrected(found, learner.algorithm.steps[2])  # type: ignore[attr-defined]
-    loss = GuidanceDistillationLoss(learner.prior)
+    loss = algorithm(trainer).loss
     before = float(loss(states)["loss_objective"].detach())
-    optimizer = torch.optim.AdamW(learner.parameters, lr=2e-5)
+    optimizer = torch.optim.AdamW(learner.parameters, lr=1e-4)
     for _ in range(8):
         optimizer.zero_grad()
         loss(states)["loss_objective"].backward()
         optimizer.step()
-    assert float(loss(states)["loss_objective"].detach()) < 0.7 * before
+    assert float(loss(states)["loss_objective"].detach()) < 0.85 * before
 
 
 def test_a_prior_that_knows_no_position_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,7 +118,7 @@ def test_a_prior_that_knows_no_position_is_refused(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    "keys", [{"clip": 0.0}, {"states": 0}, {"memory": 0}, {"sampler_decay": 1.0}, {"strength": 2.0}]
+    "keys", [{"huber": 0.0}, {"states": 0}, {"memory": 0}, {"sampler_decay": 1.0}, {"strength": 2.0}]
 )
 def test_values_that_cannot_be_are_named(tmp_path: Path, keys: dict[str, Any]) -> None:
     with pytest.raises(InvalidInputError, match=next(iter(keys))):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
+from torch.nn import functional as F
 
 from agents.networks.geometry import RefinementConfig
 from agents.post_training.algorithms.base import AveragedSampler, BatchGradient, PlainLoss, accepted_keys, in_parts
@@ -21,15 +23,14 @@ from scene_envs.scene import POSE_FEATURES, TRANSLATION
 
 _MIN_STD = 1e-4
 """Smallest standard deviation of a denoised feature in the loss, normalised."""
-_MIN_METRES = 1e-6
-"""Smallest standard deviation of a denoised position, m, with which moves are compared."""
 
 
 class GuidanceDistillationLoss(PlainLoss):
     """Squared difference of denoised poses from a teacher's, divided by the variance of the denoiser's error.
 
     For one reverse step, the loss of an entry is an upper bound of twice the KL divergence of the prior's step from the
-    teacher's: both are normal with the same variance, which includes the error of the denoised entry.
+    teacher's: both are normal with the same variance, which includes the error of the denoised entry. With a finite
+    ``huber`` it grows linearly from that error on (Huber 1964), so a few objects that move far do not decide the rest.
 
     Accepted keys (``set_keys`` renames them):
         scene: (B, N, D) float, scenes x_t of a chain.
@@ -40,6 +41,7 @@ class GuidanceDistillationLoss(PlainLoss):
 
     Args:
         prior: prior that is trained.
+        huber: error of an entry, in standard deviations, from which on its loss is linear.
 
     Returns (``forward``): ``loss_objective`` (), a mean over the trained entries of a scene, then over the scenes.
 
@@ -57,9 +59,9 @@ class GuidanceDistillationLoss(PlainLoss):
     out_keys = ["loss_objective"]  # noqa: RUF012  (torchrl reads lists)
     prior: ScenePrior
 
-    def __init__(self, prior: ScenePrior) -> None:
+    def __init__(self, prior: ScenePrior, huber: float = math.inf) -> None:
         super().__init__()
-        self.prior = prior
+        self.prior, self.huber = prior, huber
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss of a batch of scenes of a chain."""
@@ -74,7 +76,8 @@ class GuidanceDistillationLoss(PlainLoss):
             observed=self.prior.observed_entries(x),
         )  # fmt: skip
         found = self.prior.denoised(noised, self.prior.output(noised, self._text(flat)))[..., :POSE_FEATURES]
-        entries = ((found - teacher) / self._std(t, x)).square() * weight
+        std = self._std(t, x)
+        entries = 2 * F.huber_loss(found / std, teacher / std, reduction="none", delta=self.huber) * weight
         losses = entries.sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
         return TensorDict({"loss_objective": losses.mean()}, [])
 
@@ -121,7 +124,7 @@ class GuidanceDistillation(AveragedSampler):
             network.get_submodule(RefinementConfig.name).requires_grad_(True)
         super().__init__(policy, sampler_decay=settings.sampler_decay, warm_up=0.0)
         self.settings = settings
-        self.loss = GuidanceDistillationLoss(self.prior)
+        self.loss = GuidanceDistillationLoss(self.prior, settings.huber)
         self._teacher = DenoisingPolicy(self.sampler, len(policy), chunk=policy.chunk, independent=False)
         table: Any = policy.table
         self._stds = [self.sampler.position_std(step, table) for step in range(len(policy))]
@@ -193,14 +196,13 @@ class GuidanceDistillation(AveragedSampler):
         assert denoised is not None
         movable = self.sampler.frame(x).free.expand(x.shape[:2])
         scenes = self.sampler.decode(denoised)
-        guidance, std = PhysicsGuidance(self.settings.strength, movable), self._stds[step]
-        moves = guidance(step, len(self.policy), lambda: scenes, std)
+        guidance = PhysicsGuidance(self.settings.strength, movable)
+        moves = guidance(step, len(self.policy), lambda: scenes, self._stds[step])
         assert moves is not None
         moves = moves.to(x) * movable[..., None]
-        far = (moves / std.to(x).clamp(min=_MIN_METRES)).norm(dim=-1, keepdim=True)
         target = denoised[..., :POSE_FEATURES].clone()
         scale = self.sampler.normalizer.scale[TRANSLATION].to(x)
-        target[..., TRANSLATION] += scale * moves * (self.settings.clip / far.clamp(min=self.settings.clip))
+        target[..., TRANSLATION] += scale * moves
         fields: dict[str, Any] = {
             "scene": x,
             "timestep": states["timestep"],
