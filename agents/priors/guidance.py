@@ -28,7 +28,7 @@ from scene_envs.datasets.prompts.claims import (
     SupportCount,
 )
 from scene_envs.envs.settings import check_physics_guidance
-from scene_envs.physics.correction import corrections
+from scene_envs.physics.correction import FALL, corrections
 from scene_envs.scene import POSE_FEATURES, SceneBatch
 from scene_envs.scene_types import SceneType, get_scene_type
 
@@ -49,6 +49,8 @@ _FINE = 0.03
 """Error (m) of horizontal positions below which objects are moved; above it, overlaps are not known yet."""
 _LAST_ROUNDS = 2
 """Further rounds at the last step, in which a metre costs the same along every axis."""
+_LAST_FALL = 0.3
+"""Height (m) above others from which objects come down at the last step, about that of three missing steamers."""
 
 
 class PhysicsGuidance:
@@ -57,7 +59,8 @@ class PhysicsGuidance:
     From the step on at which the horizontal error of the denoised positions is below 3 cm, objects that overlap in the
     denoised scene come apart, and floating ones come down, by ``strength`` times the moves of
     :func:`~scene_envs.physics.correction.corrections`. The following steps adapt the scene to the moves. At the last
-    step the moves change the sample itself, and further rounds take apart what one round has left.
+    step the moves change the sample itself, further rounds take apart what one round has left, and objects that float
+    up to 30 cm above others come down, as where a piece of a stack is missing.
 
     Args:
         strength: factor on the moves, 0 to 1.
@@ -82,10 +85,11 @@ class PhysicsGuidance:
             std: (3,) standard deviation of their positions along the axes of the world, m.
         """
         scenes = denoised()
-        moves = corrections(scenes, std, self._movable)
-        for _ in range(_LAST_ROUNDS if step == steps - 1 else 0):
+        rounds, fall = (_LAST_ROUNDS, _LAST_FALL) if step == steps - 1 else (0, FALL)
+        moves = corrections(scenes, std, self._movable, fall)
+        for _ in range(rounds):
             moved = scenes.with_poses(scenes.translations + moves, scenes.rotations)
-            moves = moves + corrections(moved, torch.ones_like(std), self._movable)
+            moves = moves + corrections(moved, torch.ones_like(std), self._movable, fall)
         return self.strength * moves
 
     @staticmethod

@@ -30,8 +30,8 @@ _FLOATING = 3e-4
 """Height (m) up to which an object counts as standing."""
 _TOUCHING = 1e-3
 """Difference in height (m) of parts that may touch."""
-_FALL = 0.03
-"""An object higher than this (m) above all others is not moved down."""
+FALL = 0.03
+"""An object higher than this (m) above all others is not moved down, unless a caller says so."""
 _MIN_SPREAD = 0.05
 """Smallest standard deviation along an axis, as a share of the largest one."""
 _LEVEL = (1.0, 1.0, 50.0)
@@ -54,14 +54,14 @@ _STACKED = 32
 """Objects on top of each other that come down together."""
 
 
-def corrections(batch: SceneBatch, spread: Tensor, movable: Tensor | None = None) -> Tensor:
+def corrections(batch: SceneBatch, spread: Tensor, movable: Tensor | None = None, fall: float = FALL) -> Tensor:
     """Moves (B, N, 3), m, that reduce overlap and floating: one round for each scene of a batch, on its device.
 
     First, overlapping pieces of generated furniture move apart along the floor, together with the objects on them. Then
     overlapping objects move apart by a least-distance problem, as in :func:`~scene_envs.physics.project`, at distances
     in units of ``spread`` (3,), the standard deviations of positions along the world's axes (only their ratios matter).
-    Last, each object moves straight down onto the object less than 3 cm below it. Rotations, fixed objects and those
-    that are not ``movable`` (B, N) stay, and so do all objects of a scene that is a heap; poses must be finite.
+    Last, each object moves straight down onto the object less than ``fall`` m below it. Rotations, fixed objects and
+    those that are not ``movable`` (B, N) stay, and so do all objects of a scene that is a heap; poses must be finite.
 
     >>> corrections(SceneBatch.empty("dimsum_table", 1), torch.ones(3)).abs().max()
     tensor(0.)
@@ -69,13 +69,13 @@ def corrections(batch: SceneBatch, spread: Tensor, movable: Tensor | None = None
     single = SceneBatch(batch.tensor.float(), batch.scene_type)  # as the geometry is
     free = torch.ones_like(batch.is_empty) if movable is None else movable.to(batch.tensor.device)
     parts = [
-        _corrections(single[row : row + _SCENES], spread.to(single.tensor), free[row : row + _SCENES])
+        _corrections(single[row : row + _SCENES], spread.to(single.tensor), free[row : row + _SCENES], fall)
         for row in range(0, len(batch), _SCENES)
     ]
     return torch.cat(parts).to(batch.tensor) if parts else torch.zeros_like(batch.translations)
 
 
-def _corrections(batch: SceneBatch, spread: Tensor, free: Tensor) -> Tensor:
+def _corrections(batch: SceneBatch, spread: Tensor, free: Tensor, limit: float) -> Tensor:
     cost = 1.0 / (spread / spread.max().clamp(min=1e-12)).clamp(min=_MIN_SPREAD)
     bounds = torch.tensor(batch.scene_type.workspace).to(spread)  # (2, 3)
     welded = batch.is_welded
@@ -86,7 +86,7 @@ def _corrections(batch: SceneBatch, spread: Tensor, free: Tensor) -> Tensor:
         held = ~(batch.is_furniture & free).flatten()[things.at]
         things = _furniture_apart(things, pieces, held[pieces], bounds)
     things = things._replace(translation=_apart(things, bounds, cost))
-    fall = _falls(things)
+    fall = _falls(things, limit)
     moves = things.translation - start
     moves[2] -= torch.where(fall > _FLOATING, fall, 0.0)
     found = torch.zeros_like(batch.translations)
@@ -368,7 +368,7 @@ def _chosen(directions: Tensor, best: Tensor) -> Tensor:
 # -- falls ------------------------------------------------------------------------------------------
 
 
-def _falls(things: _Things, limit: float = _FALL) -> Tensor:
+def _falls(things: _Things, limit: float) -> Tensor:
     """(n,) m, distance that each free object falls until it meets another one; 0 where it exceeds ``limit``.
 
     Objects fall straight down, without turning, the lowest first, so that each follows its support. The distance

@@ -221,6 +221,17 @@ def test_further_rounds_at_the_last_step_take_apart_what_one_round_leaves() -> N
     assert colliding(49) == 0
 
 
+def test_what_floats_high_comes_down_at_the_last_step_only() -> None:
+    """10 cm above another cube, and 40 cm above it."""
+    for height, fall in ((0.1, 0.1), (0.4, 0.0)):
+        scene = boxes(("cube", 0.0, 0.0, 0.0), ("cube", 0.0, 0.0, SIDE + height))
+        guidance = PhysicsGuidance(1.0)
+        assert not guidance(48, 50, lambda scene=scene: scene, STD).any()
+        torch.testing.assert_close(
+            guidance(49, 50, lambda scene=scene: scene, STD)[0, 2], torch.tensor([0.0, 0.0, -fall]), atol=1e-4, rtol=0.0
+        )
+
+
 def test_nothing_moves_while_positions_are_uncertain(overlapping: SceneBatch) -> None:
     assert not PhysicsGuidance.acts(torch.tensor([0.01, 0.04, 0.001]))
     assert PhysicsGuidance.acts(torch.tensor([0.01, 0.01, 0.3]))
