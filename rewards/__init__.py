@@ -4,14 +4,7 @@ A reward is any callable ``(SceneBatch, RewardContext) -> RewardOutput``. The sa
 reinforcement learning, search and evaluation.
 """
 
-from rewards.base import (
-    LearnedReward,
-    Reward,
-    RewardContext,
-    RewardOutput,
-    facts_of,
-    learned_parts,
-)
+from rewards.base import LearnedReward, Reward, RewardContext, RewardOutput, facts_of, learned_parts
 from rewards.check import check_reward
 from rewards.clearance import Clearance
 from rewards.clutter import Clutter

@@ -14,13 +14,7 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor
 
-from rewards.base import (
-    Reward,
-    RewardContext,
-    RewardOutput,
-    declared_maximum,
-    facts_of,
-)
+from rewards.base import Reward, RewardContext, RewardOutput, declared_maximum, facts_of
 from rewards.evaluation import evaluate_reward
 from rewards.registry import register_reward, resolve_reward, reward_name
 from scene_envs.errors import FINITE, Checked, InvalidInputError

@@ -24,11 +24,7 @@ from typing import Any
 from agents.cli.commands import COMMANDS, load_command
 from agents.cli.keys import compose, format_rows, help_text, keys_of, read_override
 from agents.cli.run_folder import RESUMING, Run, fresh_directory
-from agents.configuration.composition import (
-    config_text,
-    known_masks,
-    known_rewards,
-)
+from agents.configuration.composition import config_text, known_masks, known_rewards
 from agents.configuration.prior_names import find_prior, split_name
 from agents.utils.interrupts import Terminated, terminable
 from scene_envs import __version__

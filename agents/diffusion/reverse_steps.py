@@ -10,14 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from agents.diffusion.categorical import (
-    _TINY,
-    draw_unmasked,
-    inverted,
-    one_hot,
-    systematic,
-    unmasking_log_prob,
-)
+from agents.diffusion.categorical import _TINY, draw_unmasked, inverted, one_hot, systematic, unmasking_log_prob
 
 
 class ReverseStep(Protocol):

@@ -29,10 +29,7 @@ from agents.evaluation.layouts import (
     workspace_fraction,
 )
 from agents.evaluation.physics_figures import physics_figures, ready_figures, stability_figures
-from agents.evaluation.pictures import (
-    frechet_scene_distance,
-    render_classifier_accuracy,
-)
+from agents.evaluation.pictures import frechet_scene_distance, render_classifier_accuracy
 from scene_envs.datasets.prompts import KINDS, describe, parse_prompt, scene_facts
 from scene_envs.datasets.prompts.claims import NameCount, ObjectCount
 from scene_envs.envs.scoring import resolve_prior

@@ -27,14 +27,7 @@ from agents.networks.text import PADDING, Text, TextEncoder, vocabulary, warn_un
 from agents.networks.text_encoders import text_encoder
 from agents.priors.config import MixedPriorConfig
 from agents.priors.guidance import Hook
-from agents.priors.prior import (
-    DenoiserOutput,
-    NoisedScenes,
-    ScenePrior,
-    check_object_count,
-    draw_noise,
-    no_text,
-)
+from agents.priors.prior import DenoiserOutput, NoisedScenes, ScenePrior, check_object_count, draw_noise, no_text
 from scene_envs.arrays import constant_on
 from scene_envs.datasets.prompts.facts import SIDES
 from scene_envs.datasets.prompts.parser import NUMBERS, ORDINALS, SIDE_PHRASES, Nouns

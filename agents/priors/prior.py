@@ -26,13 +26,7 @@ from agents.priors.adapters import AdapterSpec, merge_adapters, parse_adapters
 from agents.priors.claim_guidance import ClaimGuidance
 from agents.priors.config import UNIONS
 from agents.priors.files import StoredPrior, explained, read_stored, write_stored
-from agents.priors.guidance import (
-    Guide,
-    Hook,
-    NumberGuidance,
-    PhysicsGuidance,
-    physics_strength,
-)
+from agents.priors.guidance import Guide, Hook, NumberGuidance, PhysicsGuidance, physics_strength
 from scene_envs.arrays import constant_on, within_memory
 from scene_envs.datasets.prompts import parse_prompt
 from scene_envs.envs.settings import check_claim_guidance, check_guidance, check_physics_guidance

@@ -15,13 +15,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from scene_envs.arrays import Array, Index, Mask, ranges
 from scene_envs.physics.engines import DAMPING, LOOK, STILL_ANGLE, STILL_WAY, Course, Engine, Moved, gravity
-from scene_envs.physics.parts import (
-    FRICTION,
-    apply,
-    matrices,
-    padded,
-    quaternions,
-)
+from scene_envs.physics.parts import FRICTION, apply, matrices, padded, quaternions
 from scene_envs.physics.placement import Objects, boxes_meet
 
 TIMESTEP = 0.002

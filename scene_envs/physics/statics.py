@@ -13,15 +13,7 @@ import numpy as np
 
 from scene_envs.arrays import Array, Index, Mask
 from scene_envs.physics.collision import NEAR, Collider, scene_pairs
-from scene_envs.physics.parts import (
-    GRAVITY,
-    ContactFace,
-    Rows,
-    apply,
-    area,
-    outline_of,
-    padded,
-)
+from scene_envs.physics.parts import GRAVITY, ContactFace, Rows, apply, area, outline_of, padded
 from scene_envs.physics.placement import Contacts, ObjectPairs, Objects, components
 
 _FLAT = 3e-4

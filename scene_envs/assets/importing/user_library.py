@@ -23,14 +23,7 @@ from scene_envs.assets.importing.build import (
     distinct_colors,
     read_entries,
 )
-from scene_envs.assets.importing.limits import (
-    READ_HERE,
-    LargeImportError,
-    in_time,
-    seconds_left,
-    timed,
-    too_slow,
-)
+from scene_envs.assets.importing.limits import READ_HERE, LargeImportError, in_time, seconds_left, timed, too_slow
 from scene_envs.assets.importing.mesh_files import MESH_SUFFIXES, Color, find_mesh, read_xml
 from scene_envs.assets.importing.robot_files import open_stage
 from scene_envs.assets.importing.solids import audit_parts
