@@ -76,8 +76,8 @@ class GuidanceDistillationLoss(PlainLoss):
             observed=self.prior.observed_entries(x),
         )  # fmt: skip
         found = self.prior.denoised(noised, self.prior.output(noised, self._text(flat)))[..., :POSE_FEATURES]
-        std = self._std(t, x)
-        entries = 2 * F.huber_loss(found / std, teacher / std, reduction="none", delta=self.huber) * weight
+        error = (found - teacher) / self._std(t, x)
+        entries = 2 * F.huber_loss(error, torch.zeros_like(error), reduction="none", delta=self.huber) * weight
         losses = entries.sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1.0)
         return TensorDict({"loss_objective": losses.mean()}, [])
 
