@@ -326,8 +326,9 @@ class MixedDenoiser(_Denoiser):
         return self._mean[t[:, None], states], self._std[t[:, None], states]
 
     def output(
-        self, x_t: Tensor, t: Tensor | int, observed: Observed | None = None, text: Text | None = None
-    ) -> tuple[Tensor, Tensor]:
+        self, x_t: Tensor, t: Tensor | int, observed: Observed | None = None, text: Text | None = None,
+        refined: bool = True,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """The raw pose output, in the units of ``process.target``, and logits.
 
         Args:
@@ -335,6 +336,7 @@ class MixedDenoiser(_Denoiser):
             t: (B,) timesteps, or one of all scenes.
             observed: entries that carry no noise.
             text: (B, L, W) tokens and (B, L) their mask.
+            refined: False leaves the refinement of the network out, if it has one.
         """
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
         alpha, _ = self.process.rates(t, pose)
@@ -351,7 +353,7 @@ class MixedDenoiser(_Denoiser):
             level = torch.where(observed.pose, torch.zeros_like(level), level)
         steps = t if isinstance(t, Tensor) else torch.full((len(pose),), t, device=pose.device)
         time = 250.0 * ratio.log() if self.reads_log_noise else (steps - 1).to(pose.dtype)
-        clean = self._affine(pose, states, t) if self.reads_estimate else ()
+        clean = self._affine(pose, states, t) if refined and self.reads_estimate else ()
         inputs = [scaled, states, position, level, *clean, *([] if observed is None else [observed.flags()])]
         if self.drops_empty:
             output, logits = self._on_present(inputs, time, text)
@@ -367,13 +369,13 @@ class MixedDenoiser(_Denoiser):
     def _run(
         self, inputs: Sequence[Tensor], time: Tensor, text: Text | None, slot_mask: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The network on scaled poses, states, positions, noise levels, what :meth:`_affine` gives if the network reads
-        it, and observed flags where there are any.
+        """The network on scaled poses, states, positions, noise levels, what :meth:`_affine` gives if a refinement
+        reads it, and observed flags where there are any.
         """
         scaled, states, position, level, *flags = inputs
         tokens, mask = (None, None) if text is None else text
         extra = {} if slot_mask is None else {"slot_mask": slot_mask}
-        if self.reads_estimate:
+        if len(flags) > 1:
             extra["clean_offset"], extra["clean_scale"], *flags = flags
         with autocast(scaled, self.precision):
             output, logits = self.replays.run(
@@ -394,10 +396,11 @@ class MixedDenoiser(_Denoiser):
         return run_packed(present, run, (POSE_FEATURES, self.categories.categories))
 
     def forward(
-        self, x_t: Tensor, t: Tensor | int, observed: Observed | None = None, text: Text | None = None
-    ) -> tuple[Tensor, Tensor]:
+        self, x_t: Tensor, t: Tensor | int, observed: Observed | None = None, text: Text | None = None,
+        refined: bool = True,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """The clean pose (B, N, 12), normalised, and the logits of the clean category (B, N, K)."""
-        output, logits = self.output(x_t, t, observed, text)
+        output, logits = self.output(x_t, t, observed, text, refined)
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
         return self._denoised(pose, states, t, output), logits
 

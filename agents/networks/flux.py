@@ -488,7 +488,7 @@ class MixedFlux(nn.Module):
                 observed.
             slot_mask: (B, N) bool, False for padding slots, to which nothing may attend; None where there are none.
             clean_offset, clean_scale: (B, N, 12) each, for modules that read the denoised scene: its poses in signal
-                units are offset + scale * pose output.
+                units are offset + scale * pose output. Without them these modules correct nothing.
 
         Returns:
             pose output (B, N, 12) and logits (B, N, K) of the clean category.
@@ -512,10 +512,8 @@ class MixedFlux(nn.Module):
         features = self.final((1 + scale) * F.layer_norm(tokens, (self.config.hidden,), eps=1e-6) + shift)
         logits = self._add(self.logits_out(features), lambda module: module.logits(scene))
         output = self._add(self.pose_out(features), lambda module: module.pose_output(scene, features))
-        if not self.config.reads_estimate:
-            return output, logits
         if clean_offset is None or clean_scale is None:
-            raise InvalidInputError("a network with refinement needs clean_offset= and clean_scale=")
+            return output, logits
         scene.estimate = clean_offset, clean_scale
         return self._add(output, lambda module: module.correction(scene, tokens, condition, output)), logits
 

@@ -106,9 +106,9 @@ class ContinuousPrior(ScenePrior):
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
         observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, eta: float = 1.0,
-        hook: Hook | None = None, closed: Tensor | None = None,
+        hook: Hook | None = None, closed: Tensor | None = None, refined: bool = True,
     ) -> Tensor:  # fmt: skip
-        """x_0 (B, N, D), as :meth:`ScenePrior.run_chain` describes it; there is no text, and ``guidance`` is not read.
+        """x_0 (B, N, D), as :meth:`ScenePrior.run_chain` describes it; there is no text and no refinement.
 
         Observed entries have the noise of each level. Closed categories leave the arg-max at the end.
         """

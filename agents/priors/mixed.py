@@ -298,7 +298,7 @@ class MixedPrior(ScenePrior):
     def transition(
         self, x_t: Tensor, step: int, table: StepTableLike, *, observed: Observed | None = None,
         text: Text | None = None, guidance: float = 0.0, free: Text | None = None, eta: float = 1.0,
-        closed: Tensor | None = None,
+        closed: Tensor | None = None, refined: bool = True,
     ) -> MixedStep:  # fmt: skip
         """p(x_{t-1} | x_t) of scenes (B, N, D); differentiable in the network's parameters.
 
@@ -314,15 +314,16 @@ class MixedPrior(ScenePrior):
             free: text of the empty prompt, as :meth:`unconditional` gives it; encoded anew when None.
             eta: noise of the pose, 1 for the ancestral step and 0 for none; categories are drawn in either case.
             closed: (B, K) bool, further categories with probability 0 in slots that are not observed.
+            refined: False leaves the refinement of the network out, if it has one.
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         self.process.check_stride(t, previous)
         observed = self.observed_entries(x_t, observed)
         if free is None and (text is None or guidance):
             free = self.unconditional(x_t.shape[0])
-        pose, logits = self.denoiser(x_t, t, observed, free if text is None else text)
+        pose, logits = self.denoiser(x_t, t, observed, free if text is None else text, refined)
         if text is not None and guidance:
-            free_pose, free_logits = self.denoiser(x_t, t, observed, free)
+            free_pose, free_logits = self.denoiser(x_t, t, observed, free, refined)
             pose = (1 + guidance) * pose - guidance * free_pose
             logits = (1 + guidance) * logits.log_softmax(-1) - guidance * free_logits.log_softmax(-1)
         if self.config.clip:
@@ -350,15 +351,16 @@ class MixedPrior(ScenePrior):
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
         observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, eta: float = 1.0,
-        hook: Hook | None = None, closed: Tensor | None = None,
+        hook: Hook | None = None, closed: Tensor | None = None, refined: bool = True,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D), as :meth:`ScenePrior.run_chain` describes it; observed entries carry no noise."""
         free = self.unconditional(len(x)) if text is None or guidance else None
         x = x if observed is None else observed.write(x)
         for step in range(len(table)):
             reverse: ReverseStep = self.transition(
-                x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta, closed=closed
-            )
+                x, step, table, observed=observed, text=text, guidance=guidance, free=free, eta=eta, closed=closed,
+                refined=refined,
+            )  # fmt: skip
             if hook is not None:
                 reverse = hook(step, x, reverse)
             x = reverse.from_noise(draw_noise(x, noises))

@@ -489,7 +489,7 @@ class ScenePrior(nn.Module, ABC):
             physics_guidance: strength with which objects are moved out of overlaps and onto supports at the last steps,
                 0 to 1, see :class:`~agents.priors.guidance.PhysicsGuidance`. None takes the strength that the
                 prior was published with (``config.physics_guidance``): 1 for shipped priors whose names end in
-                ``_feasible``, otherwise 0.
+                ``_feasible``, otherwise 0. Guided chains leave a refinement out.
             num_steps: denoiser evaluations per scene, 1..T.
             slots: slots per scene; more than trained is allowed.
             seed: seed of the torch generator; the same seed and batch size give the same scenes.
@@ -513,7 +513,8 @@ class ScenePrior(nn.Module, ABC):
             )
             text = None if texts is None else self.encode_prompts(texts)
             x = self.initial(size, wide, generator)
-            return self.run_chain(x, table, generator, text=text, guidance=guidance, eta=eta, hook=hook)
+            refined = not strength
+            return self.run_chain(x, table, generator, None, text, guidance, eta, hook, refined=refined)
 
         chunks = [
             within_memory(partial(denoised, start), min(batch_size, count - start), "batch_size")
@@ -525,7 +526,7 @@ class ScenePrior(nn.Module, ABC):
     def run_chain(
         self, x: Tensor, table: StepTable, noises: Sequence[Generator] | Generator | None,
         observed: Observed | None = None, text: Text | None = None, guidance: float = 0.0, eta: float = 1.0,
-        hook: Hook | None = None, closed: Tensor | None = None,
+        hook: Hook | None = None, closed: Tensor | None = None, refined: bool = True,
     ) -> Tensor:  # fmt: skip
         """x_0 (B, N, D) from x_T, with observed entries kept. No gradient passes.
 
@@ -538,6 +539,7 @@ class ScenePrior(nn.Module, ABC):
             guidance, eta: settings of :meth:`sample`.
             hook: hook that is called at every step.
             closed: (B, K) bool, categories that slots that are not observed do not take.
+            refined: False leaves a refinement out, as where physics guidance moves the objects.
         """
 
     def sampling_hook(
@@ -655,7 +657,9 @@ class ScenePrior(nn.Module, ABC):
         observed = Observed(self.encode(given), ~changed[..., 0], ~changed[..., 1])
         x = self.initial_from_noise(draw_noise(observed.x, generators))
         closed = self.closed_categories(given, changed)
-        x = self.run_chain(x, table, generators, observed, text, guidance, hook=hook, closed=closed)
+        x = self.run_chain(
+            x, table, generators, observed, text, guidance, hook=hook, closed=closed, refined=not strength
+        )
         return scenes(x)
 
     def _check_prompts(

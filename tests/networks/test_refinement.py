@@ -93,8 +93,7 @@ def test_poses_are_corrected_and_logits_are_not() -> None:
     (before, logits), (after, same) = plain(**told), refined(**given)
     assert (after - before).abs().amax(dim=(1, 2)).min() > 1e-3
     torch.testing.assert_close(same, logits, rtol=0, atol=0)
-    with pytest.raises(InvalidInputError, match="clean_offset= and clean_scale="):
-        refined(**told)
+    torch.testing.assert_close(refined(**told)[0], before, rtol=0, atol=0)
 
 
 def test_it_reads_the_denoised_scene_and_observed_poses_as_they_are() -> None:
@@ -139,8 +138,9 @@ def prior(request: pytest.FixtureRequest) -> MixedPrior:
     return with_modules(tiny_prior("dimsum_table", process="mixed"), *request.param)
 
 
-def test_a_prior_gets_a_refinement_that_is_saved_with_it(prior: MixedPrior, tmp_path: Path) -> None:
-    before = prior.sample(2, num_steps=4, seed=0)
+def test_a_refinement_is_saved_with_its_prior_and_left_out_of_guided_chains(prior: MixedPrior, tmp_path: Path) -> None:
+    before, guided = (prior.sample(2, num_steps=4, seed=0, physics_guidance=strength) for strength in (0.0, 1.0))
+    moved = prior.rearrange(before, num_steps=4, physics_guidance=1.0)
     refined = prior.with_refinement()
     torch.testing.assert_close(refined.sample(2, num_steps=4, seed=0).tensor, before.tensor, rtol=0, atol=0)
     assert refined.with_refinement() is refined
@@ -151,6 +151,8 @@ def test_a_prior_gets_a_refinement_that_is_saved_with_it(prior: MixedPrior, tmp_
     after = loaded.sample(2, num_steps=4, seed=0)
     torch.testing.assert_close(after.tensor, refined.sample(2, num_steps=4, seed=0).tensor, rtol=0, atol=0)
     assert not torch.equal(after.tensor, before.tensor)
+    assert torch.equal(loaded.sample(2, num_steps=4, seed=0, physics_guidance=1.0).tensor, guided.tensor)
+    assert torch.equal(loaded.rearrange(before, num_steps=4, physics_guidance=1.0).tensor, moved.tensor)
 
 
 def test_a_timestep_of_all_scenes_and_one_of_each_denoise_alike(prior: MixedPrior) -> None:
