@@ -29,14 +29,7 @@ _RESULTS = (
     "viewer.html",
 )
 """Files that a command must not write over, unless they are its own."""
-_PARTS = (
-    "export.json",
-    "search.journal",
-    "log.csv",
-    "real_scenes.safetensors",
-    "prior",
-    "clutter",
-)
+_PARTS = ("export.json", "search.journal", "log.csv", "real_scenes.safetensors", "prior", "clutter")
 """Partial results of a command that was ended early; they count in a folder that has the log of a command."""
 _RESUMES = {
     "generate": "metadata.json",
@@ -48,17 +41,7 @@ _RESUMES = {
 RESUMING = ("generate", "pretrain", "post-train", "search", "demo", "evaluate")
 """Commands that go on where an earlier one ended, and themselves compare their keys with those in the folder. Programs
 whose settings have ``compares_keys`` do the same."""
-_MAY_DIFFER = (
-    "output",
-    "workers",
-    "device",
-    "pictures",
-    "open",
-    "progress",
-    "recipe",
-    "reward_limits",
-    "formats",
-)
+_MAY_DIFFER = ("output", "workers", "device", "pictures", "open", "progress", "recipe", "reward_limits", "formats")
 """Keys that may change between a run and its repetition."""
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, ClassVar
 
@@ -23,6 +23,7 @@ from agents.networks.denoisers import products_in
 from agents.networks.flux_modules import (
     CountConditioningConfig,
     CountEmbeddingConfig,
+    CountLogitsConfig,
     FluxModule,
     FourierFeatures,
     FourierFeaturesConfig,
@@ -291,6 +292,7 @@ MODULES: dict[str, type[ModuleConfig]] = {
         RotationFeaturesConfig,
         ContactsConfig,
         RefinementConfig,
+        CountLogitsConfig,
     )
 }
 """The configurations of all modules by name; a new module is one more entry."""
@@ -494,7 +496,7 @@ class MixedFlux(nn.Module):
             pose output (B, N, 12) and logits (B, N, K) of the clean category.
         """
         scene = Scene(states, observed, slot_mask)
-        text, text_mask = self._take_text(scene, text, text_mask)
+        text, text_mask = self.take_text(scene, text, text_mask)
         self._read_geometry(scene, position, noise_level)
         embedded = timestep_embedding(time * self.config.time_scale, _TIME_WIDTH).to(pose.dtype)
         condition = F.silu(self._add(self.time_in(embedded), lambda module: module.condition(scene)))
@@ -517,20 +519,18 @@ class MixedFlux(nn.Module):
         scene.estimate = clean_offset, clean_scale
         return self._add(output, lambda module: module.correction(scene, tokens, condition, output)), logits
 
-    def refined(self, shapes: Sequence[Sequence[float]]) -> MixedFlux:
-        """This network with a refinement whose correction is 0, for assets of these ``shapes``, see
-        :class:`~agents.networks.geometry.RefinementConfig`.
+    def extended(self, added: ModuleConfig) -> MixedFlux:
+        """This network with one more module.
 
         Raises:
-            InvalidInputError: it has no relations, or a refinement already.
+            InvalidInputError: it has the module, or lacks one that the module requires.
         """
-        added = RefinementConfig(tuple(tuple(shape) for shape in shapes))
         with torch.random.fork_rng(devices=[]):  # the random state of the caller stays
             torch.manual_seed(0)  # the same start in every process
             network = MixedFlux(replace(self.config, modules=(*self.config.modules, added)))
         network = network.to(next(self.parameters()))
         network.load_state_dict(self.state_dict(), strict=False)
-        network.get_submodule(RefinementConfig.name).start_like(self)  # type: ignore[operator]
+        getattr(network, added.name).start_like(self)
         return network
 
     def groups_by_number(self, text: Tensor) -> Tensor | None:
@@ -588,7 +588,7 @@ class MixedFlux(nn.Module):
             value = value if part is None else value + part
         return value
 
-    def _take_text(self, scene: Scene, text: Tensor | None, mask: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+    def take_text(self, scene: Scene, text: Tensor | None, mask: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
         """The tokens after those of single modules, with their mask; puts theirs, and the mean, into ``scene``."""
         if text is None:
             return None, mask

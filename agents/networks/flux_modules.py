@@ -1,6 +1,7 @@
 """Modules that are added to the Flux core: their interface, and those that read flags, text, counts or translations.
 
-Attention computes averages, but a prompt asks for numbers of objects: two modules count. The modules that read relative
+Attention computes averages, but the numbers of objects in a scene depend on each other and on a prompt: three modules
+count. The modules that read relative
 positions and rotations are in :mod:`agents.networks.geometry`.
 """
 
@@ -75,6 +76,9 @@ class FluxModule(nn.Module):
     The core calls the hooks in the order in which they are defined here. It calls each hook for all modules, in the
     order of the configuration, and adds what they return. All must be permutation-equivariant in the slots.
     """
+
+    def start_like(self, network: Any) -> None:
+        """Take weights of a trained network, to which the module is added."""
 
     def condition(self, scene: Scene) -> Tensor | None:
         """(B, H) that is added to the embedded time, which modulates every block."""
@@ -251,12 +255,53 @@ class CountEmbedding(FluxModule):
         )
 
     def condition(self, scene: Scene) -> Tensor | None:
-        counts = count_states(scene.states, self.categories, scene.slot_mask).to(next(self.parameters()).dtype)
-        inputs = [counts / 8.0, counts.log1p()]
-        if self.text_width:
-            nothing = counts.new_zeros(len(counts), self.text_width)
-            inputs.append(nothing if scene.summary is None else scene.summary)
-        return self.layers(torch.cat(inputs, dim=1))
+        return self.layers(_counts_and_text(scene, self.categories, self.text_width, next(self.parameters())))
+
+
+def _counts_and_text(scene: Scene, categories: int, text_width: int, like: Tensor) -> Tensor:
+    """(B, 2K + W) counts of visible slots, on two scales, and the mean text token, in the number format of ``like``."""
+    counts = count_states(scene.states, categories, scene.slot_mask).to(like.dtype)
+    text = counts.new_zeros(len(counts), text_width) if scene.summary is None or not text_width else scene.summary
+    return torch.cat([counts / 8.0, counts.log1p(), text], dim=1)
+
+
+@dataclass(frozen=True)
+class CountLogitsConfig(ModuleConfig):
+    """Logits of the categories from the numbers of visible objects."""
+
+    name = "count_logits"
+    place = "output"
+
+    def build(self, core: Any) -> CountLogits:
+        return CountLogits(core.categories, core.text_width)
+
+
+class CountLogits(FluxModule):
+    """Logits (B, 1, K) that are added to those of every slot, from counts of visible slots and the mean text token.
+
+    Numbers of objects depend on each other: a table of a restaurant has four chairs. Through the modulation of blocks a
+    network learns this slowly; here two layers read all counts at once. The logits start at zero.
+
+    >>> module = CountLogits(categories=3, text_width=0)
+    >>> module.logits(Scene(torch.tensor([[0, 0, 1, 2, 3, 3]]))).tolist()
+    [[[0.0, 0.0, 0.0]]]
+    """
+
+    def __init__(self, categories: int, text_width: int, width: int = 256) -> None:
+        super().__init__()
+        self.categories, self.text_width = categories, text_width
+        self.layers = nn.Sequential(
+            nn.Linear(2 * categories + text_width, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(),
+            nn.Linear(width, categories),
+        )  # fmt: skip
+        start_at_zero(self.layers[-1])
+
+    def inputs(self, scene: Scene) -> Tensor:
+        """(B, 2K + W) what the layers read of a scene."""
+        return _counts_and_text(scene, self.categories, self.text_width, next(self.parameters()))
+
+    def logits(self, scene: Scene) -> Tensor:
+        return self.layers(self.inputs(scene))[:, None]
 
 
 _DELTA = 0.02

@@ -263,13 +263,7 @@ class _Run:
         write_text(folder / "config.yaml", sealed(config_text(plain)))
 
     def plan(
-        self,
-        planner: Any,
-        actions: int,
-        budget: int,
-        part: range,
-        name: str,
-        max_seconds: float = math.inf,
+        self, planner: Any, actions: int, budget: int, part: range, name: str, max_seconds: float = math.inf
     ) -> tuple[SearchEnv, Session, list[PlanResult]]:
         """The environment with ``actions`` actions per state, the session, and a plan of ``budget`` scenes per search
         of ``part``.

@@ -171,10 +171,7 @@ class PostTrainer:
         started = time.perf_counter() - self.seconds
         self._write_log()  # removes the rows of an earlier run, or rows beyond the checkpoint
         style = config.progress if self.processes.is_first else "none"
-        with (
-            run_progress(title, config.iterations, style, self.iteration, after) as report,
-            finishing_steps() as end,
-        ):
+        with run_progress(title, config.iterations, style, self.iteration, after) as report, finishing_steps() as end:
             while self.iteration < config.iterations and not self._stopped:
                 batch, row = self.step()
                 self.seconds = time.perf_counter() - started

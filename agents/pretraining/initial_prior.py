@@ -55,6 +55,8 @@ def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
     takes the scene type of its data; if a grammar makes the data, it takes that of the prior.
     """
     older = PriorFacts.of(config.prior) if config.prior else None
+    if config.module and older is None:
+        raise InvalidInputError(f"module={config.module} is trained alone, so it needs a trained prior; give prior=")
     if older is not None and config.text.is_read and not older.text:
         raise InvalidInputError(
             f"text={config.text.encoder} with prior={config.prior!r}, which reads no prompts; leave text= out, or "
@@ -164,6 +166,7 @@ def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str
         raise InvalidInputError(f"the prior {config.prior!r} cannot be trained further on this data: it has {wrong}")
     _check_constants(prior, raw[:FITTED_ON, len(prior.scene_type.fixed) :], config.prior)
     prior.warn_unknown_words(prompt for group in prompts for prompt in group)
+    prior = prior.with_module(config.module) if config.module else prior
     return prior.with_open_empty(config.loss.open_empty_share)
 
 

@@ -368,6 +368,8 @@ class PretrainConfig(SceneKeys, TrainingKeys, ProgressKeys):
             It must be empty if there are several datasets.
         prior: prior from which training starts: a shipped name, or the folder of a prior or a run. Its scene type,
             network, process and text encoder stay as they are. Empty for a fresh prior.
+        module: module of the network of ``prior=`` that alone is trained, and that it gets if it has none:
+            ``count_logits``. Empty trains all weights.
         output: run folder; a run that was interrupted there is resumed; empty for runs/COMMAND-TIME on the command
             line, runs/pretrain in Python.
         iterations: optimiser steps.
@@ -384,6 +386,7 @@ class PretrainConfig(SceneKeys, TrainingKeys, ProgressKeys):
     """
 
     prior: str = ""
+    module: Annotated[str, OneOf(("", "count_logits"), "module to train")] = ""
     iterations: Natural = 5000
     batch_size: Count = 128
     seed: Seed = 0
@@ -392,10 +395,7 @@ class PretrainConfig(SceneKeys, TrainingKeys, ProgressKeys):
     loss: LossSettings = nested(LossSettings)
     text: TextSettings = nested(TextSettings, folder="text", option="none", registered=lambda: TEXT_ENCODERS)
     optimizer: PretrainOptimizerSettings = nested(
-        PretrainOptimizerSettings,
-        folder="optimizer",
-        option="muon",
-        registered=lambda: PRETRAIN_OPTIMIZERS,
+        PretrainOptimizerSettings, folder="optimizer", option="muon", registered=lambda: PRETRAIN_OPTIMIZERS
     )
     logger: PretrainLoggerSettings = nested(
         PretrainLoggerSettings, folder="logger", option="csv", registered=lambda: LOGGERS

@@ -14,10 +14,14 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Generator, Tensor, nn
+from torch.nn import functional as F
 from torch.optim.lr_scheduler import LambdaLR
 
 from agents.configuration.composition import MAX_GRADIENT_NORM, check_same_keys, config_text
 from agents.configuration.prior_names import short_name
+from agents.diffusion.reverse_steps import state_of
+from agents.networks.flux_modules import Scene
+from agents.networks.text import Text
 from agents.pretraining.initial_prior import TrainingData, prepare
 from agents.pretraining.optimizers import build_optimizer, learning_rate_at
 from agents.pretraining.settings import WEIGHT_DECAY, PretrainConfig
@@ -43,6 +47,8 @@ _CHUNK = 256
 """Number of held-out scenes per pass."""
 _RESIDUAL = 512
 """Number of held-out scenes on which the residual error of the denoiser is measured."""
+_UPDATES, _ROWS, _SLOTS = 15, 256, 32
+"""Optimiser steps of a module per batch of scenes, states in each, and masked slots of a state that are kept."""
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _RATE, _RISE = 3e-3, 0.2
 """Peak learning rate of the text warm-up, and the share of its steps in which it rises."""
@@ -87,6 +93,11 @@ class Pretrainer:
             )
         self.prior = prior.to(self.device).train()
         self.network: nn.Module = prior.denoiser
+        self.states: dict[str, Tensor] = {}  # on which a module alone is trained
+        if config.module:
+            if self.processes.size > 1:
+                raise InvalidInputError(f"module={config.module} is trained by one process, not {self.processes.size}")
+            self.network.requires_grad_(False).get_submodule(f"network.{config.module}").requires_grad_(True)
         settings = config.optimizer
         prior.denoiser.precision = _PRECISIONS[settings.compute.precision]
         self.average = WeightAverage(self.network, settings.ema)
@@ -130,6 +141,8 @@ class Pretrainer:
                     logger.debug("%s", "  ".join(f"{key} {value:.6g}" for key, value in row.items()))
                     self.logger.log({key: value for key, value in row.items() if key != "step"}, self.step)
         self.logger.close()
+        if self.config.module:  # poses are denoised as before
+            return self.save_prior()
         if self.processes.is_first:
             logger.info("measuring the residual error at 40 noise levels, for the samplers")
         with averaged_weights(self.network, self.average):
@@ -185,6 +198,8 @@ class Pretrainer:
 
     def _update(self) -> tuple[float, float]:
         config = self.config
+        if config.module:
+            return self._module_update()
         total = torch.zeros((), device=self.device)
         for part in range(config.optimizer.compute.accumulate):
             generator = derived_generator(
@@ -219,17 +234,67 @@ class Pretrainer:
 
     def _part_loss(self, count: int, generator: Generator) -> Tensor:
         """The loss of ``count`` scenes, each with one of its prompts, or without a prompt if it is withheld."""
+        x0, text = self._drawn(count, generator)
+        return self.prior.pretraining_loss(x0, generator, text=text)
+
+    def _drawn(self, count: int, generator: Generator) -> tuple[Tensor, Text | None]:
+        """``count`` scenes (count, N, D), and their text if the prior reads any."""
         reads = self.prior.conditional
         scenes, prompts = self.data.draw(count, generator, prompts=reads)
         x0 = scenes.to(self.device)
         if not reads:
-            return self.prior.pretraining_loss(x0, generator)
+            return x0, None
         choice = torch.rand(2, count, generator=generator).tolist()
         texts = [
             "" if dropped < self.config.text.dropout else group[int(pick * len(group))]
             for group, pick, dropped in zip(prompts, *choice, strict=True)
         ]
-        return self.prior.pretraining_loss(x0, generator, text=self.prior.encode_prompts(texts))
+        return x0, self.prior.encode_prompts(texts)
+
+    def _module_update(self) -> tuple[float, float]:
+        """Keep the masked states of one more batch, and train the module on some of all that are kept."""
+        generator = derived_generator(self.config.seed, self.step, 0)
+        new = within_memory(lambda count: self._masked_states(count, generator), self.config.batch_size, "batch_size")
+        self.states = {key: torch.cat([self.states[key], new[key]]) for key in new} if self.states else new
+        module: Any = self.network.get_submodule(f"network.{self.config.module}")
+        total, norm = 0.0, 0.0
+        for _ in range(_UPDATES):
+            rows = torch.randint(len(self.states["inputs"]), (_ROWS,), generator=generator)
+            inputs, logits, category = (self.states[key][rows].to(self.device) for key in new)
+            sums = logits.float() + module.layers(inputs)[:, None]
+            losses = F.cross_entropy(sums.transpose(1, 2), category.long(), reduction="none")  # not of -100
+            loss = (losses.sum(dim=1) / (category >= 0).sum(dim=1).clamp(min=1)).mean()
+            loss.backward()  # type: ignore[no-untyped-call]
+            norm = float(nn.utils.clip_grad_norm_(module.parameters(), MAX_GRADIENT_NORM))
+            total += float(loss.detach())
+            if not math.isfinite(total + norm):
+                raise self._not_finite("loss or gradient norm", total + norm)
+            self.optimizer.step()
+            self.optimizer.zero_grad(set_to_none=True)
+        self.average.update(self.network)
+        self.schedule.step()
+        return total / _UPDATES, norm
+
+    @torch.no_grad()
+    def _masked_states(self, count: int, generator: Generator) -> dict[str, Tensor]:
+        """What count logits read of ``count`` noised scenes (count, 2K + W), and the logits of the rest of the network
+        (count, S, K) and the categories (count, S) of up to S masked slots of each, -100 for none, on the CPU.
+        """
+        prior: Any = self.prior
+        network, (x0, text) = prior.denoiser.network, self._drawn(count, generator)
+        masked = prior.categories.schedule.mask.cpu() * x0.shape[1] >= 0.5  # half a slot of a scene on average
+        t = torch.multinomial(masked.double(), count, replacement=True, generator=generator)
+        noised = prior.noised(x0, generator, t.to(self.device))
+        text = prior.unconditional(count) if text is None else text
+        scene, drawn = Scene(state_of(noised.x_t[..., POSE_FEATURES:])), noised.drawn
+        network.take_text(scene, *((None, None) if text is None else text))
+        inputs = network.count_logits.inputs(scene)
+        logits = prior.output(noised, text).logits - network.count_logits.layers(inputs)[:, None]
+        chance = drawn + torch.rand(drawn.shape, generator=generator).to(self.device)
+        slots = chance.topk(min(_SLOTS, drawn.shape[1]), dim=1).indices
+        category = torch.where(drawn > 0, noised.category, -100).gather(1, slots)
+        logits = logits.gather(1, slots[..., None].expand(-1, -1, logits.shape[2]))
+        return {"inputs": inputs.cpu(), "logits": logits.half().cpu(), "category": category.to(torch.int16).cpu()}
 
     def _schedule(self) -> LambdaLR:
         """Schedule of the learning rate from the present step on; it depends only on the number of the step."""
@@ -249,6 +314,7 @@ class Pretrainer:
                 "seconds": self.seconds,
                 "history": self.history,
                 "data": self._data_facts(),
+                "states": self.states,
             }
             save_checkpoint(self.checkpoint_path, state)
         self.save_prior()
@@ -275,7 +341,7 @@ class Pretrainer:
                 f"the run in {str(self.directory)!r} cannot be resumed: it has another network or optimiser; "
                 "give the same keys again, or another output"
             ) from error
-        self.step, self.seconds = state["step"], state["seconds"]
+        self.step, self.seconds, self.states = state["step"], state["seconds"], state.get("states", {})
         self.schedule = self._schedule()
         logger.info("resumed at step %d", self.step)
 

@@ -21,7 +21,8 @@ from agents.diffusion.gaussian import loss_weights
 from agents.diffusion.reverse_steps import ReverseStep, state_of
 from agents.networks.denoisers import MixedDenoiser, Observed
 from agents.networks.flux import MixedFlux
-from agents.networks.flux_modules import CountConditioning
+from agents.networks.flux_modules import CountConditioning, CountLogitsConfig, ModuleConfig
+from agents.networks.geometry import RefinementConfig
 from agents.networks.registry import build_network
 from agents.networks.text import PADDING, Text, TextEncoder, vocabulary, warn_unknown
 from agents.networks.text_encoders import text_encoder
@@ -271,16 +272,18 @@ class MixedPrior(ScenePrior):
         self.config = replace(self.config, open_empty_share=share)
         return self
 
-    def with_refinement(self) -> MixedPrior:
-        """This prior with a refinement, see :meth:`ScenePrior.with_refinement`."""
+    def with_module(self, name: str) -> MixedPrior:
+        """This prior with the module ``name``, see :meth:`ScenePrior.with_module`."""
         network = self.denoiser.network
-        if self.denoiser.reads_estimate:
+        if hasattr(network, name):
             return self
-        if not isinstance(network, MixedFlux) or not hasattr(network, "relations") or not self.scene_type.has_geometry:
-            return super().with_refinement()  # raises
-        boxes = [self.scene_type.library[name].bounds for name in self.scene_type.assets]  # (2, 3) each
-        shapes = [[*(0.5 * (low + high)).tolist(), *(0.5 * (high - low)).tolist()] for low, high in boxes]
-        self.denoiser.network = network.refined(shapes).train(network.training)
+        added: ModuleConfig = CountLogitsConfig()
+        if name == RefinementConfig.name and hasattr(network, "relations") and self.scene_type.has_geometry:
+            boxes = [self.scene_type.library[asset].bounds for asset in self.scene_type.assets]  # (2, 3) each
+            added = RefinementConfig(tuple((*(low + high) / 2, *(high - low) / 2) for low, high in boxes))
+        if not isinstance(network, MixedFlux) or added.name != name:
+            return super().with_module(name)  # raises
+        self.denoiser.network = network.extended(added).train(network.training)
         self.config = replace(self.config, network=self.denoiser.network.config)
         return self
 

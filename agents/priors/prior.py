@@ -424,16 +424,19 @@ class ScenePrior(nn.Module, ABC):
         """
         return self
 
-    def with_refinement(self: Prior) -> Prior:
-        """This prior, whose network corrects denoised scenes (:class:`~agents.networks.geometry.Refinement`).
+    def with_module(self: Prior, name: str) -> Prior:
+        """This prior, whose network has the module ``name``; a new one changes nothing until it is trained.
 
-        A new refinement corrects nothing until it is trained; a prior that has one is not changed.
+        Args:
+            name: ``refinement``, which corrects denoised scenes (:class:`~agents.networks.geometry.Refinement`), or
+                ``count_logits``, with which the numbers of objects depend on each other
+                (:class:`~agents.networks.flux_modules.CountLogits`).
 
         Raises:
-            InvalidInputError: the assets have no geometry, or the network no relations.
+            InvalidInputError: the network cannot have the module.
         """
         raise InvalidInputError(
-            "a refinement needs a mixed flux network with relations, and assets with geometry, and "
+            f"{name} needs a mixed flux network, a refinement also relations and assets with geometry, and "
             f"{self.loaded_as or self.scene_type.name!r} lacks one of them; take another prior"
         )
 

@@ -196,10 +196,7 @@ class DenoisingCore:
 
     @torch.no_grad()
     def reset(
-        self,
-        rngs: Sequence[np.random.Generator],
-        mask: BoolArray | None = None,
-        prompts: Sequence[str] | None = None,
+        self, rngs: Sequence[np.random.Generator], mask: BoolArray | None = None, prompts: Sequence[str] | None = None
     ) -> None:
         """Start new episodes.
 

@@ -83,11 +83,7 @@ def spent(rows: Rows) -> Tensor:
 
 
 def stack(
-    rows: Rows,
-    batch: SceneBatch,
-    name: str,
-    dtype: torch.dtype = torch.float32,
-    shape: tuple[int, ...] | None = None,
+    rows: Rows, batch: SceneBatch, name: str, dtype: torch.dtype = torch.float32, shape: tuple[int, ...] | None = None
 ) -> Tensor:
     """(B, N) tensor of a named result (or (B, *shape)), zeros where a row is invalid."""
     shape = (batch.tensor.shape[1],) if shape is None else shape
@@ -295,11 +291,7 @@ def feasibility(
             limit is negative or NaN, or the duration is not a positive number.
         MissingDependencyError: the engine is not installed.
     """
-    limits = {
-        "max_penetration": max_penetration,
-        "max_displacement": max_displacement,
-        "max_rotation": max_rotation,
-    }
+    limits = {"max_penetration": max_penetration, "max_displacement": max_displacement, "max_rotation": max_rotation}
     check_numbers(duration, **limits)
     pool = chosen_pool(pool, physics)
     if pool.engine == "warp":

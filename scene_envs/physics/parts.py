@@ -266,12 +266,7 @@ def quaternions(matrices: Array) -> Array:
     x, y, z = m[7] - m[5], m[2] - m[6], m[3] - m[1]
     xy, xz, yz = m[1] + m[3], m[2] + m[6], m[5] + m[7]
     forms = np.array(
-        [
-            [1 + a - b - c, xy, xz, x],
-            [xy, 1 - a + b - c, yz, y],
-            [xz, yz, 1 - a - b + c, z],
-            [x, y, z, 1 + a + b + c],
-        ]
+        [[1 + a - b - c, xy, xz, x], [xy, 1 - a + b - c, yz, y], [xz, yz, 1 - a - b + c, z], [x, y, z, 1 + a + b + c]]
     )  # (form, component, n)
     best = np.array([a, b, c, a + b + c]).argmax(axis=0)
     quaternion = forms[best, :, np.arange(len(best))]

@@ -30,11 +30,7 @@ _CONTACT, _TABLE = 0.05, 0.68
 
 
 def write_viewer(
-    batch: SceneBatch,
-    path: str | os.PathLike[str],
-    *,
-    captions: Sequence[str] | None = None,
-    title: str | None = None,
+    batch: SceneBatch, path: str | os.PathLike[str], *, captions: Sequence[str] | None = None, title: str | None = None
 ) -> Path:
     """Write scenes as one HTML file that any browser with WebGL 2 draws, without a network; returns its path.
 
@@ -55,12 +51,7 @@ def write_viewer(
     return Path(path)
 
 
-def viewer_page(
-    batch: SceneBatch,
-    *,
-    captions: Sequence[str] | None = None,
-    title: str | None = None,
-) -> str:
+def viewer_page(batch: SceneBatch, *, captions: Sequence[str] | None = None, title: str | None = None) -> str:
     """The page of :func:`write_viewer` as text.
 
     A page that shows it in a frame can call ``sceneViewer.showScene(k)`` of the frame's window to show scene k.

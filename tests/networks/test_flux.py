@@ -32,6 +32,7 @@ ALL: dict[str, Any] = {
         {"name": "relations"},
         {"name": "rotation_features"},
         {"name": "contacts"},
+        {"name": "count_logits"},
     ],
     "text_width": 12,
 }

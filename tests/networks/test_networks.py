@@ -36,7 +36,10 @@ EQUIVARIANT = ("flux", "midiffusion")
 BASELINES = ("midiffusion", "diffuscene")
 
 
-SEEN = [{"name": name} for name in ("observed_flags", "count_embedding", "relations", "rotation_features", "contacts")]
+SEEN = [
+    {"name": name}
+    for name in ("observed_flags", "count_embedding", "relations", "rotation_features", "contacts", "count_logits")
+]
 READ: list[dict[str, Any]] = [{"name": "pooled_text"}, {"name": "count_conditioning", "largest": 9}]
 
 

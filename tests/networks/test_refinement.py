@@ -65,7 +65,7 @@ def inputs(slots: int = 5) -> dict[str, Any]:
 
 
 def trained() -> MixedFlux:
-    refined = network().refined(SHAPES).double()
+    refined = network().extended(RefinementConfig(SHAPES)).double()
     for parameter in refined.refinement.parameters():
         nn.init.normal_(parameter, std=0.3)
     return refined
@@ -73,7 +73,7 @@ def trained() -> MixedFlux:
 
 def test_a_new_refinement_corrects_nothing_and_learns() -> None:
     plain, given = network(), inputs()
-    refined = plain.refined(SHAPES).double()
+    refined = plain.extended(RefinementConfig(SHAPES)).double()
     assert refined.config == replace(plain.config, modules=(*MODULES, RefinementConfig(SHAPES)))
     told = {name: value for name, value in given.items() if not name.startswith("clean")}
     for before, after in zip(plain(**told), refined(**given), strict=True):
@@ -141,9 +141,9 @@ def prior(request: pytest.FixtureRequest) -> MixedPrior:
 def test_a_refinement_is_saved_with_its_prior_and_left_out_of_guided_chains(prior: MixedPrior, tmp_path: Path) -> None:
     before, guided = (prior.sample(2, num_steps=4, seed=0, physics_guidance=strength) for strength in (0.0, 1.0))
     moved = prior.rearrange(before, num_steps=4, physics_guidance=1.0)
-    refined = prior.with_refinement()
+    refined = prior.with_module("refinement")
     torch.testing.assert_close(refined.sample(2, num_steps=4, seed=0).tensor, before.tensor, rtol=0, atol=0)
-    assert refined.with_refinement() is refined
+    assert refined.with_module("refinement") is refined
     for parameter in refined.denoiser.network.refinement.parameters():
         nn.init.normal_(parameter, std=0.3)
     refined.save(tmp_path)
@@ -157,7 +157,7 @@ def test_a_refinement_is_saved_with_its_prior_and_left_out_of_guided_chains(prio
 
 def test_a_timestep_of_all_scenes_and_one_of_each_denoise_alike(prior: MixedPrior) -> None:
     """Chains give one timestep, training gives one of each scene."""
-    refined = prior.with_refinement()
+    refined = prior.with_module("refinement")
     for parameter in refined.denoiser.network.refinement.parameters():
         nn.init.normal_(parameter, std=0.1)
     x = refined.initial(3, 8, Generator().manual_seed(0))
@@ -170,5 +170,5 @@ def test_a_timestep_of_all_scenes_and_one_of_each_denoise_alike(prior: MixedPrio
 @pytest.mark.parametrize("process", ["mixed", "continuous"])
 def test_a_prior_without_relations_is_refused(process: str) -> None:
     tiny = tiny_prior("dimsum_table", process=process)
-    with pytest.raises(InvalidInputError, match="needs a mixed flux network with relations"):
-        tiny.with_refinement()
+    with pytest.raises(InvalidInputError, match="refinement needs a mixed flux network"):
+        tiny.with_module("refinement")

@@ -70,5 +70,5 @@ def test_states_are_those_of_all_steps_at_which_guidance_acts_and_the_oldest_are
 
 
 def test_a_prior_that_can_have_no_refinement_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="a refinement needs a mixed flux network"):
+    with pytest.raises(InvalidInputError, match="refinement needs a mixed flux network"):
         PostTrainer(config(tmp_path), prior=ScenePrior.load("dimsum_table_continuous"))

@@ -191,6 +191,69 @@ def test_text_that_an_older_prior_does_not_read_is_refused(tmp_path: Path) -> No
         prepare(PretrainConfig(prior=str(tmp_path / "older"), data="grammar", text="vocabulary"))
 
 
+def module_run(folder: Path, iterations: int) -> tuple[Pretrainer, MixedPrior, torch.Tensor]:
+    """A run of count logits on scenes whose 1 to 8 objects are all of one of two kinds."""
+    slots, kinds = torch.arange(34), 5 + torch.arange(64)[:, None] // 8 % 2
+    present = (slots > 0) & (slots < 2 + torch.arange(64)[:, None] % 8)
+    categories = torch.where(present, kinds, torch.where(slots == 0, 0, 7))
+    at = torch.zeros(64, 34, 3), torch.eye(3).expand(64, 34, 3, 3)
+    scenes = SceneBatch.from_parts(*at, categories, SceneBatch.empty("dimsum_table", 1).scene_type)
+    older = tiny_prior("dimsum_table", process="mixed")
+    prior = ScenePrior.load(older.save(folder / "older")).with_module("count_logits")
+    assert prior.with_module("count_logits") is prior
+    assert isinstance(older, MixedPrior)
+    config = PretrainConfig(
+        prior=str(folder / "older"), module="count_logits", output=str(folder / "run"), iterations=iterations,
+        batch_size=32, optimizer={"name": "adamw", "lr": 5e-3, "ema": 0.0, "rate": {"warmup": 1}},
+        logger={"checkpoint_every": 2},
+    )  # fmt: skip
+    x0 = prior.encode(scenes)
+    return Pretrainer(config, SceneTable(x0), x0[:8], prior), older, x0
+
+
+def test_count_logits_alone_learn_which_objects_belong_together(tmp_path: Path) -> None:
+    """One object that is visible shows the kind of the others. No other weight changes."""
+    run, older, x0 = module_run(tmp_path, 30)
+    trained = run.run()
+    assert isinstance(trained, MixedPrior)
+    old, new = older.denoiser.state_dict(), trained.denoiser.state_dict()
+    assert {name for name in new if name not in old} == {n for n in new if n.startswith("network.count_logits.")}
+    assert all(torch.equal(new[name], tensor) for name, tensor in old.items())
+    state = x0[[4, 12]].clone()
+    state[:, 2:, 12:] = 0.0  # masked
+    logits = trained.denoiser(state, 500)[1][:, 33]
+    odds = logits[:, 6] - logits[:, 5]
+    assert odds[0] < -2.0
+    assert odds[1] > 2.0
+
+
+def test_a_killed_run_of_a_module_resumes_bit_for_bit(tmp_path: Path) -> None:
+    whole = module_run(tmp_path / "whole", 4)[0].run()
+    broken = module_run(tmp_path / "broken", 4)[0]
+    update = broken._update
+
+    def dies_at_step_three() -> tuple[float, float]:
+        if broken.step == 3:
+            raise Killed
+        return update()
+
+    broken._update = dies_at_step_three  # type: ignore[method-assign]
+    with pytest.raises(Killed):
+        broken.run()
+    resumed = module_run(tmp_path / "broken", 4)[0].run()
+    for ours, theirs in zip(resumed.denoiser.parameters(), whole.denoiser.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_a_module_is_trained_in_a_prior_that_can_have_it(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="module=count_logits is trained alone, so it needs a trained prior"):
+        prepare(PretrainConfig(module="count_logits", data="grammar"))
+    with pytest.raises(InvalidInputError, match="count_logits needs a mixed flux network"):
+        tiny_prior("dimsum_table").with_module("count_logits")
+    with pytest.raises(UnknownNameError, match="count_logits"):
+        PretrainConfig(module="contacts")
+
+
 @pytest.mark.slow
 def test_a_truncated_checkpoint_is_named(config: PretrainConfig, raw: torch.Tensor) -> None:
     run = make_run(config, raw)

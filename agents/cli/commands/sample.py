@@ -86,11 +86,7 @@ def run(settings: SampleConfig, run: Run) -> None:
     strength = physics_strength(settings.physics_guidance, prior.config, prior.scene_type)
     started = time.perf_counter()
     batch = draw(
-        prior,
-        settings,
-        settings.count,
-        physics_guidance=strength,
-        **{key: getattr(settings, key) for key in _SAMPLED},
+        prior, settings, settings.count, physics_guidance=strength, **{key: getattr(settings, key) for key in _SAMPLED}
     )
     seconds = time.perf_counter() - started
     guided = f", with physics_guidance={strength:g}" if strength else ""

@@ -81,11 +81,7 @@ class DDPOSFLoss(PlainLoss):
     step_weights: Tensor
 
     def __init__(
-        self,
-        policy: DenoisingPolicy,
-        *,
-        step_weights: Tensor | None = None,
-        clip_epsilon: float | None = None,
+        self, policy: DenoisingPolicy, *, step_weights: Tensor | None = None, clip_epsilon: float | None = None
     ) -> None:
         super().__init__()
         if clip_epsilon is not None and not 0 < clip_epsilon < 1:

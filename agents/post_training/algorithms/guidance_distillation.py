@@ -120,7 +120,7 @@ class GuidanceDistillation(AveragedSampler):
                 f"{prior.scene_type.name!r} does not have; take another algorithm, such as nft"
             )
         if isinstance(settings, RefinementSettings):
-            network = prior.with_refinement().requires_grad_(False).denoiser.network
+            network = prior.with_module(RefinementConfig.name).requires_grad_(False).denoiser.network
             network.get_submodule(RefinementConfig.name).requires_grad_(True)
         super().__init__(policy, sampler_decay=settings.sampler_decay, warm_up=0.0)
         self.settings = settings
