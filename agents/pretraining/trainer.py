@@ -48,7 +48,7 @@ _CHUNK = 256
 _RESIDUAL = 512
 """Number of held-out scenes on which the residual error of the denoiser is measured."""
 _UPDATES, _ROWS, _SLOTS = 15, 256, 32
-"""Optimiser steps of a module per batch of scenes, states in each, and masked slots of a state that are kept."""
+"""Mean optimiser steps of a module per batch of scenes, states in each, and masked slots of a state that are kept."""
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _RATE, _RISE = 3e-3, 0.2
 """Peak learning rate of the text warm-up, and the share of its steps in which it rises."""
@@ -258,12 +258,13 @@ class Pretrainer:
         self.states = {key: torch.cat([self.states[key], new[key]]) for key in new} if self.states else new
         module: Any = self.network.get_submodule(f"network.{self.config.module}")
         total, norm = 0.0, 0.0
-        for _ in range(_UPDATES):
+        updates = math.ceil(2 * _UPDATES * (self.step + 1) / self.config.iterations)  # every state equally often
+        for _ in range(updates):
             rows = torch.randint(len(self.states["inputs"]), (_ROWS,), generator=generator)
-            inputs, logits, category = (self.states[key][rows].to(self.device) for key in new)
+            inputs, logits, category, weight = (self.states[key][rows].to(self.device) for key in new)
             sums = logits.float() + module.layers(inputs)[:, None]
             losses = F.cross_entropy(sums.transpose(1, 2), category.long(), reduction="none")  # not of -100
-            loss = (losses.sum(dim=1) / (category >= 0).sum(dim=1).clamp(min=1)).mean()
+            loss = (losses.sum(dim=1) * weight).mean()
             loss.backward()  # type: ignore[no-untyped-call]
             norm = float(nn.utils.clip_grad_norm_(module.parameters(), MAX_GRADIENT_NORM))
             total += float(loss.detach())
@@ -273,17 +274,19 @@ class Pretrainer:
             self.optimizer.zero_grad(set_to_none=True)
         self.average.update(self.network)
         self.schedule.step()
-        return total / _UPDATES, norm
+        return total / updates, norm
 
     @torch.no_grad()
     def _masked_states(self, count: int, generator: Generator) -> dict[str, Tensor]:
-        """What count logits read of ``count`` noised scenes (count, 2K + W), and the logits of the rest of the network
-        (count, S, K) and the categories (count, S) of up to S masked slots of each, -100 for none, on the CPU.
+        """For ``count`` noised scenes, on the CPU: ``inputs`` (count, 2K + W) of count logits, ``logits`` (count, S, K) of
+        the rest and ``category`` (count, S), -100 for none, of up to S masked slots, and ``weight`` (count,). Weighted
+        sums over slots bound the negative log-likelihood of a slot, nats.
         """
         prior: Any = self.prior
         network, (x0, text) = prior.denoiser.network, self._drawn(count, generator)
-        masked = prior.categories.schedule.mask.cpu() * x0.shape[1] >= 0.5  # half a slot of a scene on average
-        t = torch.multinomial(masked.double(), count, replacement=True, generator=generator)
+        masked = prior.categories.schedule.mask.cpu()
+        often = (masked * x0.shape[1] >= 0.5).double()  # half a slot of a scene on average
+        t = torch.multinomial(often, count, replacement=True, generator=generator)
         noised = prior.noised(x0, generator, t.to(self.device))
         text = prior.unconditional(count) if text is None else text
         scene, drawn = Scene(state_of(noised.x_t[..., POSE_FEATURES:])), noised.drawn
@@ -294,7 +297,15 @@ class Pretrainer:
         slots = chance.topk(min(_SLOTS, drawn.shape[1]), dim=1).indices
         category = torch.where(drawn > 0, noised.category, -100).gather(1, slots)
         logits = logits.gather(1, slots[..., None].expand(-1, -1, logits.shape[2]))
-        return {"inputs": inputs.cpu(), "logits": logits.half().cpu(), "category": category.to(torch.int16).cpu()}
+        rate = (1 - masked[t - 1] / masked[t]) * often.sum() / x0.shape[1]  # at which masked slots are unmasked
+        weight = rate * (drawn.sum(dim=1) / (category >= 0).sum(dim=1).clamp(min=1)).cpu()
+        kept = {
+            "inputs": inputs,
+            "logits": logits.half(),
+            "category": category.to(torch.int16),
+            "weight": weight.float(),
+        }
+        return {key: value.cpu() for key, value in kept.items()}
 
     def _schedule(self) -> LambdaLR:
         """Schedule of the learning rate from the present step on; it depends only on the number of the step."""
