@@ -520,11 +520,7 @@ class MixedFlux(nn.Module):
         return self._add(output, lambda module: module.correction(scene, tokens, condition, output)), logits
 
     def extended(self, added: ModuleConfig) -> MixedFlux:
-        """This network with one more module.
-
-        Raises:
-            InvalidInputError: it has the module, or lacks one that the module requires.
-        """
+        """This network with one more module; an InvalidInputError if it lacks one that this module requires."""
         with torch.random.fork_rng(devices=[]):  # the random state of the caller stays
             torch.manual_seed(0)  # the same start in every process
             network = MixedFlux(replace(self.config, modules=(*self.config.modules, added)))

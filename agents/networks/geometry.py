@@ -596,10 +596,7 @@ class Refinement(FluxModule):
         self.register_buffer("rotations", torch.tensor(core.rotations), persistent=False)
 
     def start_like(self, network: Any) -> None:
-        """Take the weights of a network's relations, contacts if it has them, last block and last layers.
-
-        The correction is then 0.
-        """
+        """Take the network's relations, contacts if it has them, last block and last layers; the correction is 0."""
         fresh = ("out.", "gates.", "touch.2.")  # these are 0 at the start
         parts: list[tuple[nn.Module, Any]] = [
             (self.near, network.relations), (self.block, network.single_blocks[-1]), (self.final, network.final),

@@ -44,10 +44,8 @@ FITTED_ON = 20_000
 """Largest number of scenes to which moments are fitted."""
 PROMPTS_PER_SCENE = 3
 
-_SAMPLE = 1024
-"""Number of scenes of a grammar to which the moments and the vocabulary are fitted."""
-_HELD_OUT = 512
-"""Number of held-out scenes of a grammar."""
+_SAMPLE, _HELD_OUT = 1024, 512
+"""Scenes of a grammar to which the moments and the vocabulary are fitted, and held-out ones."""
 
 
 def prepare(config: PretrainConfig) -> tuple[ScenePrior, TrainingData, Tensor]:
@@ -166,8 +164,8 @@ def _started(config: PretrainConfig, raw: Tensor, prompts: Sequence[Sequence[str
         raise InvalidInputError(f"the prior {config.prior!r} cannot be trained further on this data: it has {wrong}")
     _check_constants(prior, raw[:FITTED_ON, len(prior.scene_type.fixed) :], config.prior)
     prior.warn_unknown_words(prompt for group in prompts for prompt in group)
-    prior = prior.with_module(config.module) if config.module else prior
-    return prior.with_open_empty(config.loss.open_empty_share)
+    prior = prior.with_open_empty(config.loss.open_empty_share)
+    return prior.with_module(config.module) if config.module else prior
 
 
 def _check_constants(prior: ScenePrior, free: Tensor, name: str) -> None:

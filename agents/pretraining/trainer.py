@@ -43,10 +43,8 @@ FIELDS = ("step", "loss", "heldout", "gradient_norm", "learning_rate", "seconds"
 """Columns of ``log.csv``."""
 _MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe", "progress")
 """Keys that may change between a run and its continuation."""
-_CHUNK = 256
-"""Number of held-out scenes per pass."""
-_RESIDUAL = 512
-"""Number of held-out scenes on which the residual error of the denoiser is measured."""
+_CHUNK, _RESIDUAL = 256, 512
+"""Held-out scenes per pass, and those on which the residual error of the denoiser is measured."""
 _UPDATES, _ROWS, _SLOTS = 15, 256, 32
 """Mean optimiser steps of a module per batch of scenes, states in each, and masked slots of a state that are kept."""
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -278,9 +276,9 @@ class Pretrainer:
 
     @torch.no_grad()
     def _masked_states(self, count: int, generator: Generator) -> dict[str, Tensor]:
-        """For ``count`` noised scenes, on the CPU: ``inputs`` (count, 2K + W) of count logits, ``logits`` (count, S, K) of
-        the rest and ``category`` (count, S), -100 for none, of up to S masked slots, and ``weight`` (count,). Weighted
-        sums over slots bound the negative log-likelihood of a slot, nats.
+        """Of ``count`` noised scenes, on the CPU: ``inputs`` (count, 2K + W) of count logits, ``logits`` (count, S, K)
+        of the rest and ``category`` (count, S), -100 for none, of up to S masked slots, and ``weight`` (count,).
+        Weighted sums over the slots bound the negative log-likelihood of a slot, nats.
         """
         prior: Any = self.prior
         network, (x0, text) = prior.denoiser.network, self._drawn(count, generator)
