@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -62,10 +62,8 @@ def products_in(precision: str, like: Tensor) -> Iterator[None]:
 # -- CUDA graphs ----------------------------------------------------------------------------------
 
 
-_CAPTURED_AT = 3
-"""Call of a layout that is captured: the first calls of a chain may be the only ones."""
-_MAX_GRAPHS = 48
-"""Layouts that are captured; calls of further ones launch their kernels one by one."""
+_CAPTURED_AT = 3  # call of a layout that is captured: the first calls of a chain may be the only ones
+_MAX_GRAPHS = 48  # layouts that are captured; calls of further ones launch their kernels one by one
 
 Capture = Callable[[Callable[[], Any], Any], tuple[Callable[[], None], Any]]
 """``(call, pool) -> replay, outputs``: ``replay()`` repeats ``call`` on the same memory and fills ``outputs``."""
@@ -114,7 +112,8 @@ class Replays:
         given = [*inputs, *named.values()]
         layout = tuple((value.shape, value.dtype) if isinstance(value, Tensor) else value for value in given)
         weights = tuple(weight.data_ptr() for weight in network.parameters())
-        key = tuple(named), layout, inputs[0].device, getattr(network, "body_precision", ""), weights
+        state = [getattr(network, name, "") for name in ("body_precision", "left_out")]
+        key = tuple(named), layout, inputs[0].device, *state, weights
         if len(self._known) >= 4 * _MAX_GRAPHS and key not in self._known:  # of weights that were replaced
             self._known.clear()
         known = self._known.setdefault(key, 0)
@@ -327,7 +326,7 @@ class MixedDenoiser(_Denoiser):
 
     def output(
         self, x_t: Tensor, t: Tensor | int, observed: Observed | None = None, text: Text | None = None,
-        refined: bool = True,
+        left_out: Collection[str] = (),
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """The raw pose output, in the units of ``process.target``, and logits.
 
@@ -336,7 +335,7 @@ class MixedDenoiser(_Denoiser):
             t: (B,) timesteps, or one of all scenes.
             observed: entries that carry no noise.
             text: (B, L, W) tokens and (B, L) their mask.
-            refined: False leaves the refinement of the network out, if it has one.
+            left_out: names of modules that this call leaves out: ``refinement``, ``count_logits``.
         """
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
         alpha, _ = self.process.rates(t, pose)
@@ -353,7 +352,8 @@ class MixedDenoiser(_Denoiser):
             level = torch.where(observed.pose, torch.zeros_like(level), level)
         steps = t if isinstance(t, Tensor) else torch.full((len(pose),), t, device=pose.device)
         time = 250.0 * ratio.log() if self.reads_log_noise else (steps - 1).to(pose.dtype)
-        clean = self._affine(pose, states, t) if refined and self.reads_estimate else ()
+        self.network.left_out = frozenset(left_out)  # type: ignore[assignment]
+        clean = self._affine(pose, states, t) if self.reads_estimate and "refinement" not in left_out else ()
         inputs = [scaled, states, position, level, *clean, *([] if observed is None else [observed.flags()])]
         if self.drops_empty:
             output, logits = self._on_present(inputs, time, text)
@@ -397,10 +397,10 @@ class MixedDenoiser(_Denoiser):
 
     def forward(
         self, x_t: Tensor, t: Tensor | int, observed: Observed | None = None, text: Text | None = None,
-        refined: bool = True,
+        left_out: Collection[str] = (),
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """The clean pose (B, N, 12), normalised, and the logits of the clean category (B, N, K)."""
-        output, logits = self.output(x_t, t, observed, text, refined)
+        output, logits = self.output(x_t, t, observed, text, left_out)
         pose, states = x_t[..., :POSE_FEATURES], state_of(x_t[..., POSE_FEATURES:])
         return self._denoised(pose, states, t, output), logits
 

@@ -434,6 +434,7 @@ class MixedFlux(nn.Module):
 
     def __init__(self, config: MixedFluxConfig) -> None:
         super().__init__()
+        self.left_out: frozenset[str] = frozenset()  # names of modules that calls leave out for now
         self.config = config
         hidden, width = config.hidden, config.embedding
         read = POSE_FEATURES + sum(module.pose_width for module in config.modules)
@@ -575,7 +576,7 @@ class MixedFlux(nn.Module):
                 self.add_module(module.name, module.build(self.config))
 
     def _added(self) -> Iterator[FluxModule]:
-        return (getattr(self, module.name) for module in self.config.modules)
+        return (getattr(self, module.name) for module in self.config.modules if module.name not in self.left_out)
 
     def _add(self, value: Tensor, hook: Callable[[FluxModule], Tensor | None]) -> Tensor:
         """``value`` plus what a hook of every module returns."""

@@ -304,8 +304,7 @@ class CountLogits(FluxModule):
         return self.layers(self.inputs(scene))[:, None]
 
 
-_DELTA = 0.02
-"""Number of objects that is added before a logarithm is taken, so that it is finite."""
+_DELTA = 0.02  # number of objects that is added before a logarithm is taken, so that it is finite
 _KNOWN = 0.8
 """A text gives the number of a kind if the likeliest number has at least this probability."""
 _MIN_REST = 0.1

@@ -44,8 +44,7 @@ ROTATION_FEATURES = 9 + 4
 _TILTS = torch.tensor([6, 7, 2, 5])
 """Entries R_20, R_21, R_02 and R_12 of a row-major matrix."""
 _MIN_ROTATION_NOISE = 1e-4
-_TILT_REACH = 4.0
-"""Standard deviations at which the distance from upright saturates."""
+_TILT_REACH = 4.0  # standard deviations at which the distance from upright saturates
 
 
 @dataclass(frozen=True)
@@ -209,8 +208,7 @@ def pair_features(metres: Tensor, noise: Tensor, scales: Tensor) -> Tensor:
     return torch.cat([*parts, z / (zz + along_z).sqrt(), x / reach_x, y / reach_y]).movedim(0, -1)
 
 
-_LEAST = -60.0
-"""Least exponent of a feature."""
+_LEAST = -60.0  # least exponent of a feature
 
 
 def _gaussian(exponent: Tensor) -> Tensor:

@@ -324,9 +324,12 @@ class MixedPrior(ScenePrior):
         observed = self.observed_entries(x_t, observed)
         if free is None and (text is None or guidance):
             free = self.unconditional(x_t.shape[0])
-        pose, logits = self.denoiser(x_t, t, observed, free if text is None else text, refined)
+        left_out = [] if refined else [RefinementConfig.name]
         if text is not None and guidance:
-            free_pose, free_logits = self.denoiser(x_t, t, observed, free, refined)
+            left_out.append(CountLogitsConfig.name)  # guidance would amplify it
+        pose, logits = self.denoiser(x_t, t, observed, free if text is None else text, left_out)
+        if text is not None and guidance:
+            free_pose, free_logits = self.denoiser(x_t, t, observed, free, left_out)
             pose = (1 + guidance) * pose - guidance * free_pose
             logits = (1 + guidance) * logits.log_softmax(-1) - guidance * free_logits.log_softmax(-1)
         if self.config.clip:

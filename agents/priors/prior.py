@@ -428,8 +428,7 @@ class ScenePrior(nn.Module, ABC):
         """This prior, whose network has the module ``name``; a new one changes nothing until it is trained.
 
         Args:
-            name: ``refinement``, which corrects denoised scenes (:class:`~agents.networks.geometry.Refinement`), or
-                ``count_logits``, with which the numbers of objects depend on each other
+            name: ``refinement`` (:class:`~agents.networks.geometry.Refinement`) or ``count_logits``
                 (:class:`~agents.networks.flux_modules.CountLogits`).
 
         Raises:
