@@ -1,8 +1,7 @@
 """Modules that are added to the Flux core: their interface, and those that read flags, text, counts or translations.
 
-Attention computes averages, but the numbers of objects in a scene depend on each other and on a prompt: three modules
-count. The modules that read relative
-positions and rotations are in :mod:`agents.networks.geometry`.
+Attention computes averages, but numbers of objects depend on each other and on a prompt: three modules count. Modules
+that read relative positions and rotations are in :mod:`agents.networks.geometry`.
 """
 
 from __future__ import annotations
@@ -279,8 +278,9 @@ class CountLogitsConfig(ModuleConfig):
 class CountLogits(FluxModule):
     """Logits (B, 1, K) that are added to those of every slot, from counts of visible slots and the mean text token.
 
-    Numbers of objects depend on each other: a table of a restaurant has four chairs. Through the modulation of blocks a
-    network learns this slowly; here two layers read all counts at once. The logits start at zero.
+    Numbers of objects depend on each other: a table of a restaurant has four chairs. Modulated blocks learn it slowly,
+    and two layers on all counts fast. The logits start at zero. Classifier-free guidance would amplify them, so it
+    leaves them out.
 
     >>> module = CountLogits(categories=3, text_width=0)
     >>> module.logits(Scene(torch.tensor([[0, 0, 1, 2, 3, 3]]))).tolist()
