@@ -39,19 +39,24 @@ class Killed(Exception):
     """Stands for a killed process."""
 
 
+def dies_at(run: Pretrainer, step: int) -> None:
+    """Let a run end before it takes ``step``."""
+    update = run._update
+
+    def dying() -> tuple[float, float]:
+        if run.step == step:
+            raise Killed
+        return update()
+
+    run._update = dying  # type: ignore[method-assign]
+
+
 @pytest.mark.slow
 def test_a_killed_run_resumes_bit_for_bit(config: PretrainConfig, raw: torch.Tensor, tmp_path: Path) -> None:
     whole = make_run(replace(config, output=str(tmp_path / "whole")), raw)
     whole.run()
     broken = make_run(config, raw)
-    update = broken._update
-
-    def dies_at_step_five() -> tuple[float, float]:
-        if broken.step == 5:
-            raise Killed
-        return update()
-
-    broken._update = dies_at_step_five  # type: ignore[method-assign]
+    dies_at(broken, 5)
     (config.directory / "log.csv").write_text("step,loss\n9,7.5\n")  # of another run
     with pytest.raises(Killed):
         broken.run()
@@ -230,14 +235,7 @@ def test_count_logits_alone_learn_which_objects_belong_together(tmp_path: Path) 
 def test_a_killed_run_of_a_module_resumes_bit_for_bit(tmp_path: Path) -> None:
     whole = module_run(tmp_path / "whole", 4)[0].run()
     broken = module_run(tmp_path / "broken", 4)[0]
-    update = broken._update
-
-    def dies_at_step_three() -> tuple[float, float]:
-        if broken.step == 3:
-            raise Killed
-        return update()
-
-    broken._update = dies_at_step_three  # type: ignore[method-assign]
+    dies_at(broken, 3)
     with pytest.raises(Killed):
         broken.run()
     resumed = module_run(tmp_path / "broken", 4)[0].run()
