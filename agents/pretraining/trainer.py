@@ -290,7 +290,7 @@ class Pretrainer:
         scene, drawn = Scene(state_of(noised.x_t[..., POSE_FEATURES:])), noised.drawn
         network.take_text(scene, *((None, None) if text is None else text))
         inputs = network.count_logits.inputs(scene)
-        logits = prior.output(noised, text).logits - network.count_logits.layers(inputs)[:, None]
+        _, logits = prior.denoiser.output(noised.x_t, noised.t, noised.observed, text, [self.config.module])
         chance = drawn + torch.rand(drawn.shape, generator=generator).to(self.device)
         slots = chance.topk(min(_SLOTS, drawn.shape[1]), dim=1).indices
         category = torch.where(drawn > 0, noised.category, -100).gather(1, slots)
