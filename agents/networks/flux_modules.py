@@ -261,7 +261,7 @@ def _counts_and_text(scene: Scene, categories: int, text_width: int, like: Tenso
     """(B, 2K + W) counts of visible slots, on two scales, and the mean text token, in the number format of ``like``."""
     counts = count_states(scene.states, categories, scene.slot_mask).to(like.dtype)
     text = counts.new_zeros(len(counts), text_width) if scene.summary is None or not text_width else scene.summary
-    return torch.cat([counts / 8.0, counts.log1p(), text], dim=1)
+    return torch.cat([counts / _COUNT_SCALE, counts.log1p(), text], dim=1)
 
 
 @dataclass(frozen=True)
@@ -279,8 +279,8 @@ class CountLogits(FluxModule):
     """Logits (B, 1, K) that are added to those of every slot, from counts of visible slots and the mean text token.
 
     Numbers of objects depend on each other: a table of a restaurant has four chairs. Modulated blocks learn it slowly,
-    and two layers on all counts fast. The logits start at zero. Classifier-free guidance would amplify them, so it
-    leaves them out.
+    and two layers on all counts, one-hot below 16, fast. The logits start at zero. Completions leave them
+    out, and so does classifier-free guidance, which would amplify them.
 
     >>> module = CountLogits(categories=3, text_width=0)
     >>> module.logits(Scene(torch.tensor([[0, 0, 1, 2, 3, 3]]))).tolist()
@@ -291,24 +291,30 @@ class CountLogits(FluxModule):
         super().__init__()
         self.categories, self.text_width = categories, text_width
         self.layers = nn.Sequential(
-            nn.Linear(2 * categories + text_width, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(),
+            nn.Linear((2 + _ONE_HOT) * categories + text_width, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(),
             nn.Linear(width, categories),
         )  # fmt: skip
         start_at_zero(self.layers[-1])
 
     def inputs(self, scene: Scene) -> Tensor:
-        """(B, 2K + W) what the layers read of a scene."""
+        """(B, 2K + W) what :meth:`of` reads of a scene."""
         return _counts_and_text(scene, self.categories, self.text_width, next(self.parameters()))
 
+    def of(self, inputs: Tensor) -> Tensor:
+        """(B, 1, K) logits from :meth:`inputs`."""
+        numbers = torch.arange(_ONE_HOT, device=inputs.device)
+        same = (inputs[:, : self.categories, None] * _COUNT_SCALE).round() == numbers
+        return self.layers(torch.cat([inputs, same.flatten(1).to(inputs.dtype)], dim=1))[:, None]
+
     def logits(self, scene: Scene) -> Tensor:
-        return self.layers(self.inputs(scene))[:, None]
+        return self.of(self.inputs(scene))
 
 
+_COUNT_SCALE = 8.0  # divisor of counts as inputs
+_ONE_HOT = 16  # count logits read counts below it one-hot as well
 _DELTA = 0.02  # number of objects that is added before a logarithm is taken, so that it is finite
-_KNOWN = 0.8
-"""A text gives the number of a kind if the likeliest number has at least this probability."""
-_MIN_REST = 0.1
-"""Probability of the visible number and all larger ones; below it, fewer objects of a known number are expected."""
+_KNOWN = 0.8  # a text gives the number of a kind if the likeliest number has at least this probability
+_MIN_REST = 0.1  # below this probability of the visible number and all larger ones, fewer objects are expected
 _TINY = 1e-9
 
 

@@ -43,13 +43,11 @@ FIELDS = ("step", "loss", "heldout", "gradient_norm", "learning_rate", "seconds"
 """Columns of ``log.csv``."""
 _MAY_DIFFER = ("iterations", "output", "logger", "device", "recipe", "progress")
 """Keys that may change between a run and its continuation."""
-_CHUNK, _RESIDUAL = 256, 512
-"""Held-out scenes per pass, and those on which the residual error of the denoiser is measured."""
-_UPDATES, _ROWS, _SLOTS = 15, 256, 32
+_CHUNK, _RESIDUAL = 256, 512  # held-out scenes per pass, and those on which the residual error is measured
+_UPDATES, _ROWS, _SLOTS = 4, 256, 32
 """Mean optimiser steps of a module per batch of scenes, states in each, and masked slots of a state that are kept."""
 _PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-_RATE, _RISE = 3e-3, 0.2
-"""Peak learning rate of the text warm-up, and the share of its steps in which it rises."""
+_RATE, _RISE = 3e-3, 0.2  # peak learning rate of the text warm-up, and the share of its steps in which it rises
 
 
 @torch.no_grad()
@@ -260,7 +258,7 @@ class Pretrainer:
         for _ in range(updates):
             rows = torch.randint(len(self.states["inputs"]), (_ROWS,), generator=generator)
             inputs, logits, category, weight = (self.states[key][rows].to(self.device) for key in new)
-            sums = logits.float() + module.layers(inputs)[:, None]
+            sums = logits.float() + module.of(inputs)
             losses = F.cross_entropy(sums.transpose(1, 2), category.long(), reduction="none")  # not of -100
             loss = (losses.sum(dim=1) * weight).mean()
             loss.backward()  # type: ignore[no-untyped-call]
@@ -285,24 +283,20 @@ class Pretrainer:
         masked = prior.categories.schedule.mask.cpu()
         often = (masked * x0.shape[1] >= 0.5).double()  # half a slot of a scene on average
         t = torch.multinomial(often, count, replacement=True, generator=generator)
-        noised = prior.noised(x0, generator, t.to(self.device))
-        text = prior.unconditional(count) if text is None else text
-        scene, drawn = Scene(state_of(noised.x_t[..., POSE_FEATURES:])), noised.drawn
+        noise = torch.randn(x0.shape, generator=generator).to(self.device)
+        x_t = prior.add_noise(x0, t.to(self.device), noise)  # as in sampling, no objects but fixed ones are observed
+        text, scene = prior.unconditional(count) if text is None else text, Scene(state_of(x_t[..., POSE_FEATURES:]))
         network.take_text(scene, *((None, None) if text is None else text))
-        inputs = network.count_logits.inputs(scene)
-        _, logits = prior.denoiser.output(noised.x_t, noised.t, noised.observed, text, [self.config.module])
+        inputs, observed = network.count_logits.inputs(scene), prior.observed_entries(x_t)
+        _, logits = prior.denoiser.output(x_t, t.to(self.device), observed, text, [self.config.module])
+        drawn = scene.states == prior.num_categories
         chance = drawn + torch.rand(drawn.shape, generator=generator).to(self.device)
         slots = chance.topk(min(_SLOTS, drawn.shape[1]), dim=1).indices
-        category = torch.where(drawn > 0, noised.category, -100).gather(1, slots)
+        category = torch.where(drawn, state_of(x0[..., POSE_FEATURES:]), -100).gather(1, slots)
         logits = logits.gather(1, slots[..., None].expand(-1, -1, logits.shape[2]))
         rate = (1 - masked[t - 1] / masked[t]) * often.sum() / x0.shape[1]  # at which masked slots are unmasked
         weight = rate * (drawn.sum(dim=1) / (category >= 0).sum(dim=1).clamp(min=1)).cpu()
-        kept = {
-            "inputs": inputs,
-            "logits": logits.half(),
-            "category": category.to(torch.int16),
-            "weight": weight.float(),
-        }
+        kept = {"inputs": inputs, "logits": logits.half(), "category": category.short(), "weight": weight.float()}
         return {key: value.cpu() for key, value in kept.items()}
 
     def _schedule(self) -> LambdaLR:

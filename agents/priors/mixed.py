@@ -321,12 +321,12 @@ class MixedPrior(ScenePrior):
         """
         t, previous = int(table.timesteps[step]), int(table.previous[step])
         self.process.check_stride(t, previous)
+        left_out = [] if refined else [RefinementConfig.name]
+        if observed is not None or (text is not None and guidance):  # not trained on completions; guidance amplifies it
+            left_out.append(CountLogitsConfig.name)
         observed = self.observed_entries(x_t, observed)
         if free is None and (text is None or guidance):
             free = self.unconditional(x_t.shape[0])
-        left_out = [] if refined else [RefinementConfig.name]
-        if text is not None and guidance:
-            left_out.append(CountLogitsConfig.name)  # guidance would amplify it
         pose, logits = self.denoiser(x_t, t, observed, free if text is None else text, left_out)
         if text is not None and guidance:
             free_pose, free_logits = self.denoiser(x_t, t, observed, free, left_out)

@@ -243,17 +243,20 @@ def test_a_killed_run_of_a_module_resumes_bit_for_bit(tmp_path: Path) -> None:
         assert torch.equal(ours, theirs)
 
 
-def test_classifier_free_guidance_leaves_count_logits_out() -> None:
-    """It would amplify what they add. Chains without a prompt, and under one without guidance, have them."""
+def test_classifier_free_guidance_and_completions_leave_count_logits_out() -> None:
+    """Guidance would amplify what they add, and they are trained on scenes without observed objects. Chains without a
+    prompt, and under one without guidance, have them.
+    """
     prior = tiny_prior("dimsum_table", process="mixed", text=True)
     x, table = prior.initial(2, 34), prior.step_table(4)
     text = prior.encode_prompts(["A scene with 3 objects."] * 2)
-    ways: list[dict[str, Any]] = [{}, {"text": text}, {"text": text, "guidance": 1.0}]
+    completion = {"observed": prior.observed_entries(x)}
+    ways: list[dict[str, Any]] = [{}, {"text": text}, {"text": text, "guidance": 1.0}, completion]
     before = [prior.transition(x, 0, table, **how).probs for how in ways]
     prior = prior.with_module("count_logits")
     torch.nn.init.normal_(prior.denoiser.network.count_logits.layers[-1].weight)
     after = [prior.transition(x, 0, table, **how).probs for how in ways]
-    assert [torch.equal(*pair) for pair in zip(before, after, strict=True)] == [False, False, True]
+    assert [torch.equal(*pair) for pair in zip(before, after, strict=True)] == [False, False, True, True]
 
 
 def test_a_module_is_trained_in_a_prior_that_can_have_it(tmp_path: Path) -> None:
