@@ -18,6 +18,8 @@ from torch.nn import functional as F
 
 Place = Literal["slots", "condition", "attention", "output"]
 """The part of the core after which the weights of a module are drawn, so that a seed keeps giving the same weights."""
+_COUNT_SCALE = 8.0  # divisor of counts as inputs
+_ONE_HOT = 16  # count logits read counts below it one-hot as well
 
 
 @dataclass
@@ -297,21 +299,19 @@ class CountLogits(FluxModule):
         start_at_zero(self.layers[-1])
 
     def inputs(self, scene: Scene) -> Tensor:
-        """(B, 2K + W) what :meth:`of` reads of a scene."""
+        """(B, 2K + W) what :meth:`from_inputs` reads of a scene."""
         return _counts_and_text(scene, self.categories, self.text_width, next(self.parameters()))
 
-    def of(self, inputs: Tensor) -> Tensor:
+    def from_inputs(self, inputs: Tensor) -> Tensor:
         """(B, 1, K) logits from :meth:`inputs`."""
         numbers = torch.arange(_ONE_HOT, device=inputs.device)
         same = (inputs[:, : self.categories, None] * _COUNT_SCALE).round() == numbers
         return self.layers(torch.cat([inputs, same.flatten(1).to(inputs.dtype)], dim=1))[:, None]
 
     def logits(self, scene: Scene) -> Tensor:
-        return self.of(self.inputs(scene))
+        return self.from_inputs(self.inputs(scene))
 
 
-_COUNT_SCALE = 8.0  # divisor of counts as inputs
-_ONE_HOT = 16  # count logits read counts below it one-hot as well
 _DELTA = 0.02  # number of objects that is added before a logarithm is taken, so that it is finite
 _KNOWN = 0.8  # a text gives the number of a kind if the likeliest number has at least this probability
 _MIN_REST = 0.1  # below this probability of the visible number and all larger ones, fewer objects are expected

@@ -258,7 +258,7 @@ class Pretrainer:
         for _ in range(updates):
             rows = torch.randint(len(self.states["inputs"]), (_ROWS,), generator=generator)
             inputs, logits, category, weight = (self.states[key][rows].to(self.device) for key in new)
-            sums = logits.float() + module.of(inputs)
+            sums = logits.float() + module.from_inputs(inputs)
             losses = F.cross_entropy(sums.transpose(1, 2), category.long(), reduction="none")  # not of -100
             loss = (losses.sum(dim=1) * weight).mean()
             loss.backward()  # type: ignore[no-untyped-call]

@@ -232,6 +232,19 @@ def test_count_logits_alone_learn_which_objects_belong_together(tmp_path: Path) 
     assert odds[1] > 2.0
 
 
+def test_count_logits_are_trained_as_in_sampling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No objects but the fixed ones are observed: a completion with the same visible numbers has another rest."""
+    run, older, x0 = module_run(tmp_path, 3)
+    assert older.config.observed_share > 0.0
+    output, seen = run.prior.denoiser.output, []
+    monkeypatch.setattr(run.prior.denoiser, "output", lambda *args: seen.append(args[2]) or output(*args))
+    run.run()
+    fixed = ~older.frame(x0).free
+    states = [observed for observed in seen if len(observed.category) == 32]
+    assert len(states) == 3
+    assert all((observed.category == fixed).all() and (observed.pose == fixed).all() for observed in states)
+
+
 def test_a_killed_run_of_a_module_resumes_bit_for_bit(tmp_path: Path) -> None:
     whole = module_run(tmp_path / "whole", 4)[0].run()
     broken = module_run(tmp_path / "broken", 4)[0]
