@@ -1,7 +1,7 @@
 """By what a classifier tells samples of a prior from real scenes, and at which noise it arises.
 
     python benchmarks/realism.py errors PRIOR ... --data FOLDER [--noise 0.1 0.3 1.2] [--scenes 192]
-    python benchmarks/realism.py parts PRIOR --data FOLDER --kept cafe_table,chair floor,shelf [--scenes 2000]
+    python benchmarks/realism.py parts PRIOR --data FOLDER --kept cafe_table,chair shelf [--scenes 2000]
     python benchmarks/realism.py chains PRIOR --data FOLDER [--noise 5 0.3 0.1] [--num-steps 50] [--scenes 192]
 
 ``errors``: root mean square of the horizontal error of denoised objects of each asset, in real scenes with noise. A
@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Generator, Tensor
 
+from agents.diffusion import StepTable
 from agents.evaluation.classifier import classifier_accuracy
 from agents.evaluation.layouts import stack_wasserstein, tallest_stacks
 from agents.networks.geometry import RefinementConfig
@@ -35,17 +36,19 @@ def main() -> None:
     """Print the table that the command line names."""
     arguments = _arguments()
     scenes = SceneDataset.load(arguments.data).tensor[-arguments.scenes :].clone()
-    for number, name in enumerate(arguments.priors):
+    shown: list[int] = []  # assets of the columns
+    for name in arguments.priors:
         prior = ScenePrior.load(name)
         if not isinstance(prior, MixedPrior):
             raise InvalidInputError(f"the prior {name!r} is continuous; the tables are of mixed priors")
         real = SceneBatch(scenes, prior.scene_type)
         if arguments.table == "errors":
-            if not number:
-                print("| prior | noise, m |", *(f" {prior.scene_type.assets[k]} |" for k in _present(real)), sep="")
-                print("|---|---|", *("---|" for _ in _present(real)), sep="")
+            if not shown:
+                shown = _present(real)
+                print("| prior | noise, m |", *(f" {prior.scene_type.assets[k]} |" for k in shown), sep="")
+                print("|---|---|", *("---|" for _ in shown), sep="")
             for level in arguments.noise:
-                errors = position_errors(prior, real, level)[_present(real)].tolist()
+                errors = position_errors(prior, real, level)[shown].tolist()
                 print(f"| {name} | {level:g} |", *(f" {error:.3f} |" for error in errors), sep="", flush=True)
         elif arguments.table == "parts":
             print_parts(prior, real, arguments.kept)
@@ -55,8 +58,8 @@ def main() -> None:
 
 def _present(real: SceneBatch) -> list[int]:
     """Assets of which there is one per two scenes at least, fixed objects aside."""
-    counts = real.categories[:, len(real.scene_type.fixed) :].flatten().bincount(minlength=len(real.scene_type.assets))
-    counts = counts[: len(real.scene_type.assets)]
+    objects = real.categories[:, len(real.scene_type.fixed) :].flatten()
+    counts = objects.bincount(minlength=len(real.scene_type.assets) + 1)[:-1]
     return [k for k, count in enumerate(counts.tolist()) if count >= len(real) / 2]
 
 
@@ -122,7 +125,7 @@ def print_chains(prior: MixedPrior, real: SceneBatch, noise: Sequence[float], nu
     for level in noise:
         wanted, _ = _timestep(prior, level)
         start = int((table.timesteps - wanted).abs().argmin())
-        rest = type(table)(table.timesteps[start:], table.previous[start:])
+        rest = StepTable(table.timesteps[start:], table.previous[start:])
         ends = [prior.run_chain(x, rest, random) for _, x, random in _noisy(prior, real, int(rest.timesteps[0]))]
         batch = prior.decode(torch.cat(ends))
         mean, distance = tallest_stacks(batch).double().mean(), stack_wasserstein(batch, real)
