@@ -4,7 +4,8 @@
 
 Post-training toward a reward costs precision where noise hides the layout: stacks become shorter, chairs go to other
 tables (benchmarks/research_log.md, "Neon at the noise of layouts"). This script steps away from these errors. It
-writes a prior for each of ``--weights``, ``FOLDER/weight_1`` and so on, to be compared with ``scene-envs evaluate``.
+writes a prior for each of ``--weights``, here ``runs/neon/weight_1`` and ``runs/neon/weight_1.5``; ``scene-envs
+evaluate`` compares them. FOLDER is a dataset of the prior's scene type.
 
 Two copies of the prior theta are trained with the pretraining loss, one on real scenes and one on samples of theta,
 both with the same timesteps and noise. A prior of weight w is theta + w (theta_real - theta_own). What training
@@ -20,12 +21,14 @@ Details that matter:
  3. A step is noisy: more samples, more steps and a lower learning rate give more realism for the same loss of feasible
     objects. The weight is chosen by the feasible share and the classifier of ``evaluate``.
 
-A second call with the same ``--output`` continues: samples are kept at once, both copies every 100 steps.
+A second call with the same ``--output`` continues: samples are kept at once, both copies every 100 steps. One with
+other settings than ``--steps`` and ``--weights`` is refused.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from collections.abc import Iterable
 from copy import deepcopy
@@ -138,18 +141,32 @@ def loss_of(
 def own_samples(prior: MixedPrior, count: int, seed: int, path: Path) -> Tensor:
     """``count`` raw samples (B, N, D) of the prior, kept in ``path``."""
     if not path.is_file():
-        save_file({"scenes": prior.sample(count, seed=seed, physics_guidance=0).tensor.contiguous()}, path)
+        part = path.with_suffix(".part")
+        save_file({"scenes": prior.sample(count, seed=seed, physics_guidance=0).tensor.contiguous()}, part)
+        part.replace(path)
     return load_file(path)["scenes"]
+
+
+def require_same_settings(args: argparse.Namespace) -> None:
+    """Keep the settings in ``args.output``; an InvalidInputError if it was written with others."""
+    given = {k: v for k, v in vars(args).items() if k not in ("output", "steps", "weights")}
+    path = args.output / "settings.json"
+    kept = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else given
+    for name, value in kept.items():
+        if given[name] != value:
+            raise InvalidInputError(
+                f"{args.output} was written with --{name}={value}, not {given[name]}; give that, or another --output"
+            )
+    args.output.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(given), encoding="utf-8")
 
 
 def train(
     prior: MixedPrior, scenes: Iterable[Tensor], bands: Bands, args: argparse.Namespace, path: Path
 ) -> list[Copy]:
     """Copies of the prior that were trained on each of ``scenes`` (M, N, D); their state is kept in ``path``."""
-    copies, generator = (
-        [(Copy(prior, args.lr), prior_scenes) for prior_scenes in scenes],
-        Generator().manual_seed(args.seed),
-    )
+    copies = [(Copy(prior, args.lr), known) for known in scenes]
+    generator = Generator().manual_seed(args.seed)
     first = 0
     if path.is_file():
         kept = torch.load(path)
@@ -198,12 +215,13 @@ def main(arguments: list[str] | None = None) -> None:
         raise InvalidInputError(f"the prior {args.prior!r} is continuous; give a mixed one")
     bands = Bands(prior, *args.noise)
     real = SceneDataset.load(args.data).batch()
-    args.output.mkdir(parents=True, exist_ok=True)
+    require_same_settings(args)
     own = own_samples(prior, args.own, args.seed, args.output / "own.safetensors")
     scenes = [prior.normalised(real), prior.normalised(type(real)(own, prior.scene_type))]
     of_real, of_own = train(prior, scenes, bands, args, args.output / "copies.pt")
     for weight in args.weights:
         result = deepcopy(prior)
+        result.card = {k: v for k, v in prior.card.items() if k not in ("measures", "limits")}  # of other weights
         for name, parameter in result.named_parameters():
             if name in of_real.average:
                 parameter.data.add_(of_real.average[name] - of_own.average[name], alpha=weight)

@@ -107,3 +107,12 @@ def test_noise_that_the_prior_does_not_have_is_refused(
 ) -> None:
     with pytest.raises(InvalidInputError, match="holds no noise level of the prior; give the lowest and the highest"):
         example.Bands(base, *noise)
+
+
+def test_other_settings_in_the_same_folder_are_refused(
+    example: ModuleType, folders: tuple[str, str], tmp_path: Path
+) -> None:
+    steps(example, folders, tmp_path, 1)
+    words = [folders[0], "--data", folders[1], "--output", str(tmp_path), "--steps", "1", *RUN, "--seed", "4"]
+    with pytest.raises(InvalidInputError, match="was written with --seed=0, not 4; give that, or another --output"):
+        example.main(words)
