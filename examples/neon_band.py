@@ -17,7 +17,7 @@ published rule.
 
 With ``--contrast feasible`` both copies are trained on samples of theta, one on their feasible and one on their
 infeasible free objects, and no real scenes are needed. Objects count so that both have as many of each asset at each
-height. Otherwise the step would avoid what fails often, such as high stacks, instead of building it well.
+height, so the step gains nothing by avoiding what fails often, such as the top of a stack.
 
 Details that matter:
  1. Only noise between the two values of ``--noise`` (m, along x) is trained. At all other noise levels both copies are
