@@ -13,16 +13,10 @@ changes whatever the scenes are is in both copies, and cancels in the difference
 Neon (Alemohammad et al. 2025, arXiv 2510.03597) whose other copy is of real scenes; ``examples/neon.py`` has the
 published rule.
 
-    python examples/neon_band.py dimsum_table_feasible --contrast feasible --noise 0.05 1 --output runs/feasible
-
-With ``--contrast feasible`` both copies are trained on samples of theta, one on their feasible and one on their
-infeasible free objects, and no real scenes are needed. Objects count so that both have as many of each asset at each
-height, so the step gains nothing by avoiding what fails often, such as the top of a stack.
-
 Details that matter:
  1. Only noise between the two values of ``--noise`` (m, along x) is trained. At all other noise levels both copies are
     held at the poses of theta, and everywhere at its categories. So the last steps, which decide millimetres, and the
-    numbers of objects stay as they are. With ``--contrast feasible`` the other objects are held at all noise levels.
+    numbers of objects stay as they are.
  2. The text encoder, count logits and a refinement are not trained.
  3. A step is noisy: more samples, more steps and a lower learning rate give more realism for the same loss of feasible
     objects. The weight is chosen by the feasible share and the classifier of ``evaluate``.
@@ -38,7 +32,6 @@ import json
 import math
 from collections.abc import Iterable
 from copy import deepcopy
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -51,8 +44,6 @@ from agents.priors.mixed import MixedPrior
 from agents.priors.prior import ScenePrior
 from scene_envs.datasets import SceneDataset
 from scene_envs.errors import InvalidInputError
-from scene_envs.physics import feasibility
-from scene_envs.scene import SceneBatch
 
 FROZEN = ("text_encoder.", ".refinement.", ".count_logits.", ".count_conditioning.")
 """Parts of the names of weights that are not trained."""
@@ -60,8 +51,6 @@ POSES_HELD, CATEGORIES_HELD = 10.0, 20.0
 """Coefficients of the distances from the outputs of the prior, beside the pretraining loss."""
 SAVED_EVERY = 100
 """Optimiser steps between two checkpoints."""
-SAME_HEIGHT = 0.03
-"""Objects of an asset whose heights differ less are compared, m."""
 
 
 class Bands:
@@ -87,46 +76,6 @@ class Bands:
         parts = ((self.below, below), (self.above, above), (self.inside, count - below - above))
         drawn = [torch.multinomial(p, n, replacement=True, generator=generator) for p, n in parts if n]
         return torch.cat(drawn), torch.arange(count) < below + above
-
-
-@dataclass(frozen=True)
-class Scenes:
-    """Scenes that a copy is trained on.
-
-    Attributes:
-        x0: (M, N, D), normalised.
-        credit: (M, N) weights of the objects in the loss; None takes whole scenes.
-    """
-
-    x0: Tensor
-    credit: Tensor | None = None
-
-    def draw(self, count: int, generator: Generator) -> tuple[Tensor, Tensor | None]:
-        """``count`` scenes, each as often as it has credit, and the credit of their objects, of sum 1 in a scene."""
-        if self.credit is None:
-            return self.x0[torch.randint(len(self.x0), (count,), generator=generator)], None
-        of_scene = self.credit.sum(dim=1)
-        rows = torch.multinomial(of_scene, count, replacement=True, generator=generator)
-        return self.x0[rows], self.credit[rows] / of_scene[rows, None]
-
-
-def feasible_and_infeasible(own: SceneBatch, x0: Tensor) -> list[Scenes]:
-    """The samples, with credit of their feasible and of their infeasible free objects. Of an asset at a height both
-    have the sum of the rarer ones, at most three times the number of the feasible ones.
-    """
-    feasible = feasibility(own).feasible & own.is_free
-    infeasible = ~feasible & own.is_free
-    height = (own.tensor[..., 2] / SAME_HEIGHT).round().long()
-    _, cell = torch.unique(torch.stack([own.categories, height], dim=-1).flatten(0, 1), dim=0, return_inverse=True)
-    cell = cell.view_as(height)
-    number = [torch.bincount(cell[chosen], minlength=int(cell.max()) + 1).float() for chosen in (feasible, infeasible)]
-    total = torch.minimum(3 * number[0], number[1])
-    if not total.any():
-        raise InvalidInputError(
-            f"no asset has feasible and infeasible objects at one height in {len(own)} samples; give more with --own"
-        )
-    pairs = zip((feasible, infeasible), number, strict=True)
-    return [Scenes(x0, chosen * (total / count.clamp(min=1))[cell]) for chosen, count in pairs]
 
 
 class Copy:
@@ -167,20 +116,11 @@ class Copy:
 
 
 def loss_of(
-    copy: MixedPrior,
-    prior: MixedPrior,
-    x0: Tensor,
-    t: Tensor,
-    held: Tensor,
-    seed: int,
-    *,
-    guided: bool,
-    credit: Tensor | None = None,
+    copy: MixedPrior, prior: MixedPrior, x0: Tensor, t: Tensor, held: Tensor, seed: int, *, guided: bool
 ) -> Tensor:
     """Pretraining loss of the poses of normalised scenes (B, N, D) at timesteps (B,), but in rows ``held`` (B,) the
     distance from the poses of ``prior``, and everywhere the divergence from its categories. ``guided`` leaves out the
-    refinement, as guided chains do. With ``credit`` (B, N) the loss is of these objects, each of at most 1 so that the
-    few that have fallen do not count for more, and the poses of the others are held too.
+    refinement, as guided chains do.
     """
     noised = copy.noised(x0, Generator().manual_seed(seed), t)
     text, left_out = prior.unconditional(len(x0)), [RefinementConfig.name] if guided else []
@@ -188,23 +128,14 @@ def loss_of(
     pose, logits = copy.denoiser.output(*inputs)
     with torch.no_grad():
         pose_before, logits_before = prior.denoiser.output(*inputs)
-    weight = noised.weight.sum(dim=2)
-    total = weight.sum(dim=1).clamp(min=1)
-    moved = ((pose - pose_before).square() * noised.weight).sum(dim=2)
-    error = ((pose - noised.target).square() * noised.weight).sum(dim=2)
-    if credit is None:
-        learned = error.sum(dim=1) / total
-    else:
-        robust = error / (1 + (error / weight.clamp(min=1e-6)).detach())
-        learned = (credit * robust).sum(dim=1) / (credit * weight).sum(dim=1).clamp(min=1e-6)
-        learned = learned + (moved * (credit == 0)).sum(dim=1) / total
+    target = torch.where(held[:, None, None], pose_before, noised.target)
+    error = ((pose - target).square() * noised.weight).sum(dim=(1, 2)) / noised.weight.sum(dim=(1, 2)).clamp(min=1)
     before, after = logits_before.log_softmax(dim=-1), logits.log_softmax(dim=-1)
     drawn = noised.drawn
     assert drawn is not None  # a mixed prior
     divergence = F.kl_div(after, before, log_target=True, reduction="none").sum(dim=-1) * drawn
     categories = (divergence.sum(dim=1) / drawn.sum(dim=1).clamp(min=1)).mean()
-    kept = moved.sum(dim=1) / total
-    return POSES_HELD * kept[held].mean() + learned[~held].mean() + CATEGORIES_HELD * categories
+    return POSES_HELD * error[held].mean() + error[~held].mean() + CATEGORIES_HELD * categories
 
 
 def own_samples(prior: MixedPrior, count: int, seed: int, path: Path) -> Tensor:
@@ -231,9 +162,9 @@ def require_same_settings(args: argparse.Namespace) -> None:
 
 
 def train(
-    prior: MixedPrior, scenes: Iterable[Scenes], bands: Bands, args: argparse.Namespace, path: Path
+    prior: MixedPrior, scenes: Iterable[Tensor], bands: Bands, args: argparse.Namespace, path: Path
 ) -> list[Copy]:
-    """Copies of the prior that were trained on each of ``scenes``; their state is kept in ``path``."""
+    """Copies of the prior that were trained on each of ``scenes`` (M, N, D); their state is kept in ``path``."""
     copies = [(Copy(prior, args.lr), known) for known in scenes]
     generator = Generator().manual_seed(args.seed)
     first = 0
@@ -248,12 +179,12 @@ def train(
         seed = int(torch.randint(2**31, (1,), generator=generator))
         losses = []
         for copy, known in copies:
-            x0, credit = known.draw(args.batch, generator)
-            loss = loss_of(copy.prior, prior, x0, t, held, seed, guided=step % 2 == 1, credit=credit)
+            x0 = known[torch.randint(len(known), (args.batch,), generator=generator)]
+            loss = loss_of(copy.prior, prior, x0, t, held, seed, guided=step % 2 == 1)
             losses.append(float(loss.detach()))
             copy.update(loss, step, args.steps)
         if (step + 1) % SAVED_EVERY == 0 or step + 1 == args.steps:
-            print(f"step {step + 1} of {args.steps}: losses {losses[0]:.4f} and {losses[1]:.4f}", flush=True)
+            print(f"step {step + 1} of {args.steps}: loss {losses[0]:.4f} (real), {losses[1]:.4f} (own)", flush=True)
             part = path.with_suffix(".part")
             state = {
                 "step": step + 1,
@@ -269,8 +200,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Sample, train both copies, and write a prior for each weight."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("prior", help="shipped prior, or folder of a prior or run")
-    parser.add_argument("--contrast", choices=["real", "feasible"], default="real", help="what the first copy sees")
-    parser.add_argument("--data", help="dataset folder of its scene type, for --contrast real")
+    parser.add_argument("--data", required=True, help="dataset folder of its scene type")
     parser.add_argument("--noise", type=float, nargs=2, required=True, help="lowest and highest trained noise, m")
     parser.add_argument("--weights", type=float, nargs="+", default=[0.5, 1.0, 1.5])
     parser.add_argument("--output", type=Path, required=True)
@@ -284,20 +214,17 @@ def main(arguments: list[str] | None = None) -> None:
     if not isinstance(prior, MixedPrior):
         raise InvalidInputError(f"the prior {args.prior!r} is continuous; give a mixed one")
     bands = Bands(prior, *args.noise)
-    if (args.contrast == "real") != bool(args.data):
-        raise InvalidInputError(f"--contrast {args.contrast} with --data {args.data}: give real scenes with real alone")
-    real = SceneDataset.load(args.data).batch() if args.data else None
+    real = SceneDataset.load(args.data).batch()
     require_same_settings(args)
-    own = SceneBatch(own_samples(prior, args.own, args.seed, args.output / "own.safetensors"), prior.scene_type)
-    x0 = prior.normalised(own)
-    scenes = [Scenes(prior.normalised(real)), Scenes(x0)] if real is not None else feasible_and_infeasible(own, x0)
-    better, worse = train(prior, scenes, bands, args, args.output / "copies.pt")
+    own = own_samples(prior, args.own, args.seed, args.output / "own.safetensors")
+    scenes = [prior.normalised(real), prior.normalised(type(real)(own, prior.scene_type))]
+    of_real, of_own = train(prior, scenes, bands, args, args.output / "copies.pt")
     for weight in args.weights:
         result = deepcopy(prior)
         result.card = {k: v for k, v in prior.card.items() if k not in ("measures", "limits")}  # of other weights
         for name, parameter in result.named_parameters():
-            if name in better.average:
-                parameter.data.add_(better.average[name] - worse.average[name], alpha=weight)
+            if name in of_real.average:
+                parameter.data.add_(of_real.average[name] - of_own.average[name], alpha=weight)
         result.save(args.output / f"weight_{weight:g}")
         print(args.output / f"weight_{weight:g}", flush=True)
 

@@ -15,7 +15,6 @@ from agents.priors.testing import tiny_prior
 from scene_envs.datasets import SceneDataset
 from scene_envs.errors import InvalidInputError
 from scene_envs.normalizer import Normalizer
-from scene_envs.physics import feasibility
 
 RUN = ("--noise", "0.05", "3", "--own", "6", "--batch", "8", "--lr", "0.01", "--weights", "0.5", "2")
 
@@ -117,58 +116,3 @@ def test_other_settings_in_the_same_folder_are_refused(
     words = [folders[0], "--data", folders[1], "--output", str(tmp_path), "--steps", "1", *RUN, "--seed", "4"]
     with pytest.raises(InvalidInputError, match="was written with --seed=0, not 4; give that, or another --output"):
         example.main(words)
-
-
-def test_feasible_and_infeasible_objects_count_alike_by_asset_and_height(example: ModuleType, base: ScenePrior) -> None:
-    apart = grammar_scenes("dimsum_table", 24, seed=5)
-    tensor = apart.tensor.clone()
-    for row in range(12):  # the first free object of every other scene stands inside the second one's place
-        free = torch.nonzero(apart.is_free[row])[:, 0]
-        tensor[row, free[0], :3] = tensor[row, free[1], :3]
-    scenes = type(apart)(tensor, apart.scene_type)
-    good, bad = example.feasible_and_infeasible(scenes, base.normalised(scenes))
-    feasible = feasibility(scenes).feasible
-    assert torch.equal(bad.credit > 0, (bad.credit > 0) & ~feasible & scenes.is_free)
-    assert torch.equal(good.credit > 0, (good.credit > 0) & feasible & scenes.is_free)
-    cells = {
-        (int(scenes.categories[at]), round(float(tensor[at][2]) / example.SAME_HEIGHT))
-        for at in map(tuple, torch.nonzero(bad.credit).tolist())
-    }
-    assert cells
-    for asset, height in cells:
-        here = (scenes.categories == asset) & ((tensor[..., 2] / example.SAME_HEIGHT).round() == height)
-        assert float(good.credit[here].sum()) == pytest.approx(float(bad.credit[here].sum()), rel=1e-5)
-    rows, credit = bad.draw(64, Generator().manual_seed(0))
-    torch.testing.assert_close(credit.sum(dim=1), torch.ones(64))
-    assert rows.shape == (64, *tensor.shape[1:])
-
-
-def test_the_loss_of_chosen_objects_is_theirs_alone(example: ModuleType, base: ScenePrior) -> None:
-    scenes = grammar_scenes("dimsum_table", 2, seed=5)
-    x0, t = base.normalised(scenes), torch.tensor([400, 500])
-    free = torch.nonzero(scenes.is_free[1])[:, 0]
-    credit = torch.zeros(scenes.categories.shape)
-    credit[:, free[0]] = 1.0
-    held = torch.tensor([True, False])
-    loss = example.loss_of(base, base, x0, t, held, 3, guided=False, credit=credit)
-    noised = base.noised(x0, Generator().manual_seed(3), t)
-    with torch.no_grad():
-        pose, _ = base.denoiser.output(noised.x_t, noised.t, noised.observed, base.unconditional(2), [])
-    weight = noised.weight[1, free[0]]
-    error = float(((pose - noised.target)[1, free[0]].square() * weight).sum() / weight.sum())
-    assert float(loss.detach()) == pytest.approx(error / (1 + error), rel=1e-4)  # nothing else has moved
-
-
-def test_samples_alone_serve_for_feasible_objects(
-    example: ModuleType, base: ScenePrior, folders: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = SceneDataset.load(folders[1]).tensor
-    sunk = real.clone()
-    sunk[::2, :, 2] += torch.where(real[::2, :, 2] > 0.05, -0.01, 0.0)  # stacks pressed together
-    monkeypatch.setattr(example, "own_samples", lambda *args: sunk)
-    command = [folders[0], "--contrast", "feasible", "--output", str(tmp_path), "--steps", "2", *RUN]
-    example.main(command)
-    found, before = ScenePrior.load(tmp_path / "weight_2").weights(), base.weights()
-    assert any(not torch.equal(found[name], before[name]) for name in before)
-    with pytest.raises(InvalidInputError, match="--contrast feasible with --data"):
-        example.main([*command, "--data", folders[1]])
