@@ -41,7 +41,7 @@ class CategoryMoments:
     std: Tensor  # (K, D), floored away from zero
 
     @classmethod
-    def fit(cls, poses: Tensor, categories: Tensor, count: int, floor: float = 1e-3) -> CategoryMoments:
+    def fit(cls, poses: Tensor, categories: Tensor, count: int, floor: float = 1e-4) -> CategoryMoments:
         """Moments of poses (M, D) whose categories are (M,) in 0..``count`` - 1. A category with fewer than 20 slots
         takes those of all objects, because too small a standard deviation makes the targets of poses far from the mean
         very large. *Empty* has the mean of all objects and the standard deviation ``floor``.

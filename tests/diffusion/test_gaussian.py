@@ -232,7 +232,7 @@ def test_each_category_has_its_own_moments_and_empty_stands_still() -> None:
         torch.testing.assert_close(moments.mean[category], own.mean(dim=0), atol=1e-5, rtol=0)
         torch.testing.assert_close(moments.std[category], own.std(dim=0), atol=1e-5, rtol=0)
     torch.testing.assert_close(moments.mean[3], poses[categories != 3].mean(dim=0), atol=1e-5, rtol=0)
-    assert float(moments.std[3].max()) == pytest.approx(1e-3)
+    assert float(moments.std[3].max()) == pytest.approx(1e-4)
 
 
 @pytest.mark.parametrize("kernel", ["early_absorbing", "mask_and_replace"])
@@ -248,7 +248,24 @@ def test_moments_given_a_state_are_those_of_the_poses_that_lead_to_it(kernel: st
     for state in noisy.unique().tolist():
         own = centred[noisy == state]
         torch.testing.assert_close(mean[t, state], own.mean(dim=0), atol=0.03, rtol=0)
-        torch.testing.assert_close(std[t, state], own.std(dim=0).clamp(min=1e-3), atol=0.03, rtol=0.03)
+        torch.testing.assert_close(std[t, state], own.std(dim=0).clamp(min=1e-4), atol=0.03, rtol=0.03)
+
+
+def test_a_coordinate_that_never_varies_is_known_whatever_the_network_says() -> None:
+    """Shelves stand against a wall: in a room whose unit is 5 m, errors of a network are then at most 2 mm."""
+    poses, categories = _data(2_000)
+    poses[categories == 1, 0] = -0.95
+    moments = CategoryMoments.fit(poses, categories, 4)
+    whole = Preconditioning(poses.mean(dim=0), poses.std(dim=0), moments)
+    process = GaussianProcess(make_schedule("karras", noise_floor=0.0004), "edm", whole)
+    generator = torch.Generator().manual_seed(0)
+    own = moments.mean[1], moments.std[1]
+    for level in (1, 100, 1000):
+        clean, t = torch.tensor([-0.95, 0.3]).expand(500, 2), torch.full((500,), level)
+        noisy = process.add_noise(clean, t, torch.randn(500, 2, generator=generator))
+        output = torch.randn(500, 2, generator=generator).clamp(-3, 3)
+        found = process.x0_from_output(noisy, t, output, own)
+        assert float((found[:, 0] + 0.95).abs().max()) < 4e-4
 
 
 def test_preconditioning_survives_json() -> None:
